@@ -66,7 +66,7 @@ def claim(path: Path) -> None:
     """
     is_new = not check(path)
     with _claimed(path, os.open(path, os.O_WRONLY | os.O_CREAT | FLAGS, MODE)) as ending:
-        if not os.access(path.absolute().parent, os.W_OK | os.X_OK):  # for `replacing`
+        if not os.access(path.absolute().parent, os.W_OK | os.X_OK):  # `replacing` needs it
             raise OSError(EACCES, os.strerror(EACCES), str(path))
         if is_new:
             ending.callback(_remove_empty, path, inode(path))
@@ -253,7 +253,7 @@ class Growing:
         Raises:
             OSError: it cannot be renamed.
         """
-        with suppress(OSError):  # writing the rest of its buffer failed
+        with suppress(OSError):  # the rest of the buffer cannot be written
             self.file.close()
         if self.at == self._path:
             return

@@ -140,7 +140,7 @@ def compile_kernel(dispatcher: Any) -> None:
     if dispatcher.targetoptions.get("_nrt", True):
         rtsys.initialize(
             dispatcher.targetctx
-        )  # reference counting, which `KernelCache` does not set up
+        )  # sets up reference counting, which `KernelCache` does not
     signature = signature_of(dispatcher)
     try:
         dispatcher.compile(signature)

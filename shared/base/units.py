@@ -12,5 +12,5 @@ def seconds_to_ns(seconds: float) -> int:
 
 
 JUMP_NS = 60 * SECOND_NS
-"""Largest advance of a clock between two readings, or beyond a due wake, that is no jump, see
+"""Largest advance of a clock between readings, or beyond a due wake, that is not a jump, see
 `shared.endpoints.steady`."""

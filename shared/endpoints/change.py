@@ -117,7 +117,7 @@ class Running:
         """Carry out a request, valid or not, and return the encoded answer.
 
         Args:
-            request: the request, or a beginning that is long enough to be refused.
+            request: the request; if too long, at least its first REQUEST_BYTES_MAX + 1 bytes.
             now_ns: time on the endpoint's clock [ns].
         """
         if len(request) > REQUEST_BYTES_MAX:

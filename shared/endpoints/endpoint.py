@@ -104,8 +104,8 @@ class Endpoint(ABC):
     keeps = False
     """Whether the endpoint has state for the next run of the process, see `keep`."""
     waits_for_disk = False
-    """Whether the state on disk is outdated, so that the next run would use it until the newest is
-    written or the old one removed."""
+    """Whether the state on disk is outdated: the next run would use it, unless it is replaced or
+    removed first."""
     patience_ns = 0
     """Longest time for which datagrams are collected on busy sockets [ns].
 
@@ -162,7 +162,7 @@ class Endpoint(ABC):
         assert not keys  # there are no changeable keys by default
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:  # noqa: B027
-        """Learn the time of day, if the host knows it to within an error; ignored by default.
+        """Learn the time of day, if the host knows it and its error; ignored by default.
 
         Args:
             utc_ns: time since 1970 [ns].

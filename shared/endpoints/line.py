@@ -72,7 +72,7 @@ def parse_address(text: str) -> Address | None:
 
 
 def parse_line(key: str, text: str) -> Line:
-    """Line of the text `text`.
+    """Line that a text describes, see FORMS.
 
     Raises:
         ConfigError: the text is invalid; the message names `key`.

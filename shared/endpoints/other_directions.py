@@ -17,7 +17,7 @@ NAMES = {directions: dict(zip(KEYS, directions, strict=True)) for directions in 
 
 
 def named(text: str, names: Mapping[str, str]) -> str:
-    """Sentence with keys replaced by their names."""
+    """Sentence with keys replaced by the operator's names, see `NAMES`."""
     for key, name in names.items():
         text = text.replace(key, name)
     return text

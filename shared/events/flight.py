@@ -68,7 +68,7 @@ class Omitted(Event):
 
 
 class RecordIncomplete(Event):
-    sentence = "{file}: {reason}: the record is incomplete, the flight goes on"
+    sentence = "{file}: {reason}: the record is incomplete, the flight continues"
     file: str
     reason: str
     """Message of the operating system, such as "No space left on device"."""
@@ -78,7 +78,7 @@ class Fault(Event):
     traceback: str
 
     def __str__(self) -> str:
-        return f"an error in its code, the flight goes on\n{self.traceback.rstrip()}"
+        return f"an error in its code, the flight continues\n{self.traceback.rstrip()}"
 
 
 class FlowOpened(Event):

@@ -12,6 +12,6 @@ class PathDied(VehicleEvent):
 
 
 class PathHealed(VehicleEvent):
-    sentence = "vehicle {vehicle}: path {path} ({via}) is well again"
+    sentence = "vehicle {vehicle}: path {path} ({via}) works again"
     path: int
     via: str

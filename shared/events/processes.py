@@ -70,7 +70,7 @@ class Measured(Event):
 class NoFailsafe(Event):
     sentence = (
         "NO FAILSAFE: without a packet it holds its last input for ever; "
-        'vehicle.exhausted = "brake" has one'
+        'vehicle.exhausted = "brake" enables it'
     )
 
 
@@ -102,8 +102,8 @@ class Recalled(VehicleEvent):
 
     def __str__(self) -> str:
         if self.goes_on:
-            return f"vehicle {self.vehicle} goes on with the flight of an earlier run"
-        return f"vehicle {self.vehicle}: the flight of an earlier run is too long ago to go on"
+            return f"vehicle {self.vehicle} continues the flight of an earlier run"
+        return f"vehicle {self.vehicle}: the flight of an earlier run is too old to be continued"
 
 
 class NotRecalled(VehicleEvent):

@@ -66,10 +66,10 @@ def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Cont
             at = int(over.argmax())
             where = ", ".join(f"{each:.3g}" for each in position[at])
             demanded = f"at {at * scenario.control.dt:g} s ({where}) m at {speed[at]:.3g} m/s"
-            margin = f"{max(margins(scenario)):.2g} m inside"
+            margin = f"a margin of {max(margins(scenario)):.2g} m"
             yield (
                 key,
                 value,
-                f"{more}, for the trajectory asks {demanded}, and the fence keeps {margin}",
+                f"{more}, because the trajectory needs {demanded}, with {margin}",
             )
             return

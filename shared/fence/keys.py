@@ -43,7 +43,7 @@ class FenceConfig(Section, frozen=True):
 
     def contradictions(self, scenario: Scenario) -> Iterator[Contradiction]:
         if scenario.vehicle.on_loss == "return" and not self.has_home:
-            yield "vehicle.on_loss", "'return'", "'land', for home (0, 0) is outside the fence"
+            yield "vehicle.on_loss", "'return'", "'land': home (0, 0) is outside the fence"
         axes = scenario.model.axes
         for key, values in (("fence.low_m", self.low_m), ("fence.high_m", self.high_m)):
             if len(values) not in (0, axes):

@@ -12,7 +12,7 @@ from skytether.shared.scenario.schema import Scenario
 SLOW_STEPS = 2
 """Number of steps by which the fence's time constant T exceeds the vehicle's."""
 ERROR_S = 0.06
-"""Margin for all model errors together, as a time at the vehicle's largest speed."""
+"""Margin for all model errors together, divided by the vehicle's largest speed [s]."""
 WEAK = 1.25
 """Factor on the margin for wind, for a vehicle whose gain is 20 % below the model's."""
 LATER_S = 0.1

@@ -201,7 +201,7 @@ def _speed_key(kind: Any) -> str:
         return "hoverSpeed"
     if kind in ROVERS:
         return "cruiseSpeed"
-    expected = "that of a vehicle that can stop at each place, as a multicopter or a rover"
+    expected = "a vehicle that can stop at each place, such as a multicopter or a rover"
     raise ValueError(f"vehicleType: expected {expected}, got MAV_TYPE {str(kind)[:40]}")
 
 

@@ -205,7 +205,7 @@ def _of_csv(text: str) -> RecordedPath:
 
 
 def _unit_of_times(times: Array, name: str) -> float:
-    """Unit of a column of times without a unit; that of times since 1970 follows from size."""
+    """Unit of a column of times without a unit [s]; from their size if they count from 1970."""
     largest = float(np.nanmax(times, initial=0.0))
     for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
         if largest >= least:
@@ -231,7 +231,7 @@ def _unit(values: Array, name: str, low: float, high: float) -> float:
 
 
 class _Stamp(msgspec.Struct):
-    """Time at which a packet was sent, on a monotonic clock, or of day [ns]."""
+    """Time at which a packet was sent, on a monotonic clock, or time of day [ns]."""
 
     monotonic: float | None = None
     wall: float | None = None
@@ -259,7 +259,7 @@ class _Irtt(msgspec.Struct):
 
 _LOST = (np.nan, np.nan)
 CLOCKS_S = 1e-3
-"""Largest measurement error of irtt's one-way delays; a larger error is one of the clocks [s]."""
+"""Largest measurement error of irtt's one-way delays [s]; larger errors are those of the clocks."""
 
 
 def _of_irtt(text: str, way: Way) -> RecordedPath:

@@ -20,7 +20,7 @@ from skytether.shared.law.model import Array
 
 SHOW = "show.json"
 CONTROLS_MAX = 6
-"""Largest number of control points of a curve: Skybrush has up to degree 7."""
+"""Largest number of control points of a curve: Skybrush uses degrees up to 7."""
 WRONG = (KeyError, TypeError, AttributeError, IndexError)
 """Exceptions that Python raises if a file does not have the structure of a show."""
 

@@ -20,8 +20,8 @@ from skytether.shared.law.model import Array
 
 GLOBAL, LOCAL, HOME = "vehicle_global_position", "vehicle_local_position", "home_position"
 READS_MAX, READS_LEAST, MESSAGE_BYTES = 4_000_000, 1000, 8
-"""Largest number of reads of a log, least such limit, and smallest message [B], for two reads per
-message. The limit ends pyulog's endless loop in some damaged logs."""
+"""Largest and smallest limit of the number of reads of a log, which is two per message, and size of
+the smallest message [B]. The limit ends pyulog's endless loop in some damaged logs."""
 
 
 class _Content(io.BytesIO):

@@ -169,7 +169,7 @@ def _features(file: str, collection: Any, origin: Origin) -> Iterator[Zone]:
                 yield zone
                 corners += len(zone.corners)
                 if corners > CORNERS_MAX:
-                    return  # `geojson` raises the error
+                    return  # too many corners: `geojson` raises the error
         except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
             said = isinstance(error, ValueError)
             expected = str(error) if said else "a feature with a geometry, as RFC 7946 has it"
@@ -180,7 +180,7 @@ def _frame(collection: dict[str, Any], given: Origin) -> Frame:
     """Function from coordinates to metres north and east of the scenario's origin.
 
     Args:
-        known: `reference.origin`, which takes precedence over the collection's member.
+        given: `reference.origin`, which takes precedence over the collection's member.
 
     Raises:
         ValueError: the unit or the origin of the coordinates is missing or invalid.

@@ -16,7 +16,7 @@ def geojson(file: File) -> list[Zone]:
 
 @ZONES
 def kml(file: File, kind: Literal["keep_out", "fence"] = "keep_out") -> list[Zone]:
-    """Polygons of a KML file; vehicles keep out of all, or stay within all, by `kind`."""
+    """Polygons of a KML file, all to keep out of (keep_out), or all to stay within (fence)."""
     return zone_files.kml(file, is_fence=kind == "fence")
 
 

@@ -85,7 +85,7 @@ class PendingInputs:
         """State z in which the next input takes effect [m, m/s]; shape (axes, 2).
 
         Args:
-            known: state at the end of the step whose input was issued last [m, m/s]; shape
+            states: state at the end of the step whose input was issued last [m, m/s]; shape
                 (axes, 2).
             disturbance: disturbance of each axis until then, as an input [m/s].
         """

@@ -60,9 +60,8 @@ def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:
 
 @lru_cache
 def silences(timeout_ns: int, step_ns: int) -> tuple[tuple[float, int], ...]:
-    """Possible silences [ns], each with the largest loss for which it is short enough.
-
-    The longest comes first, shorter ones follow with increasing loss; the last is for any loss.
+    """Possible heartbeat intervals [ns], longest first, each after the largest loss ratio at which
+    it keeps `false_per_h` within FALSE_PER_H. The last one serves any loss.
     """
     fewest, most = -(-timeout_ns // (MOST * step_ns)), timeout_ns // (FEWEST * step_ns)
     counts = range(max(most, 1), max(fewest, 1) - 1, -1) or (1,)

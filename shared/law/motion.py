@@ -20,7 +20,7 @@ SAMPLES = 4
 INPUT_SHARE = 0.9
 """Share of the input bound that a motion may use."""
 MARGIN_M = 0.03
-"""Smallest margin of a plan, see `Clearances`."""
+"""Smallest margin of a plan [m], see `Clearances`."""
 
 
 Knots = Annotated[Array, 2]

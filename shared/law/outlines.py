@@ -82,7 +82,7 @@ def _off2(x: float, y: float, along_x: float, along_y: float) -> float:
 def _crosses(
     x: float, y: float, line_x: float, line_y: float, along_x: float, along_y: float
 ) -> bool:
-    """Whether an edge crosses a line; the edge starts at (x, y) from the start of the line."""
+    """Whether an edge crosses a line; (x, y): start of the edge minus start of the line [m]."""
     begins = line_x * y - line_y * x
     ends = line_x * (y + along_y) - line_y * (x + along_x)
     line_begins = along_y * x - along_x * y

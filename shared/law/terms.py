@@ -69,8 +69,8 @@ class Terms(NamedTuple):
     table: str
     """Digest of the content of the trajectory's CSV file."""
     separation_m: float = 0.5
-    """Distance between vehicles of a mission [m]. For servers, like the next two fields: two
-    servers of a vehicle must have equal values."""
+    """Distance between vehicles of a mission [m]. Like the next two fields, it must be equal in two
+    servers of a vehicle."""
     height_m: float = 0.0
     """Vertical distance between vehicles of a mission [m]; 0: `separation_m`."""
     tube_m: float = 0.15

@@ -149,8 +149,8 @@ def of_places(scenario: Scenario) -> Iterator[Contradiction]:
             expected = f"none within {clear_m:g} m of the goal ({at}) of vehicle {vehicle}"
             if around.zones[zone].is_fence:
                 expected = (
-                    f"a fence {clear_m:g} m around the goal ({at}) of vehicle {vehicle}, for "
-                    "vehicles stay within every fence"
+                    f"a fence {clear_m:g} m around the goal ({at}) of vehicle {vehicle}: "
+                    "vehicles stay within all fences"
                 )
             yield "mission.zones", around.zones[zone].name, expected
             return
@@ -162,7 +162,7 @@ def of_places(scenario: Scenario) -> Iterator[Contradiction]:
         what = "paths" if goals.is_show else "goals"
         expected = f"{most}, as the {what} of vehicles {one} and {other} at {at_s:.6g} s"
         if lands(scenario):
-            expected += " side by side, for both may land (vehicle.land_after_s = 0: never)"
+            expected += " side by side: both may land (vehicle.land_after_s = 0: never)"
         yield "mission.separation_m", mission.separation_m, expected
 
 
@@ -174,7 +174,7 @@ def _too_fast(scenario: Scenario, show: Mission) -> Iterator[Contradiction]:
         vehicle, at_s, axis, speed_mps = found
         bound = f"{most_mps[axis]:.3g} m/s on an axis, by model.u_max and mission.speed_mps"
         asked = f"vehicle {vehicle} to fly {speed_mps:.3g} m/s from {at_s:.6g} s on"
-        expected = f"a show of at most {bound}; this asks {asked}"
+        expected = f"a show of at most {bound}; this one requires {asked}"
         yield "reference.file", repr(scenario.reference.file), expected
     if show.is_show and (places := show.count_places()) > PLACES_MAX:
         most = f"at most {PLACES_MAX} different times of all points, times vehicles"

@@ -29,18 +29,18 @@ def with_argument(table: PluginTable, text: str, at: str, value: object) -> str:
 
 
 def argument(table: PluginTable, text: str, at: str) -> Value:
-    """Value of an argument in the first such entry of a text; see `with_argument`."""
+    """Value of the argument `at` in its entry's first call in a text; see `with_argument`."""
     calls, index = _argument(table, text, at)
     return calls[0].values[index]
 
 
 def _argument(table: PluginTable, text: str, at: str) -> tuple[list[Call], int]:
-    """All calls of an entry in a text, and the index of the parameter."""
+    """Calls of `at`'s entry in `text`, and the index of its parameter."""
     name, _, key = at.partition(".")
     names = [parameter.name for parameter in table[name].parameters]
     if not names or (key and key not in names):
         raise KeyError(at)
     calls = [each for each in grammar.leaves(table.parse(text)) if each.name == name]
     if not calls:
-        raise GrammarError(text, f"{name} in it")
+        raise GrammarError(text, f"a text with {name}")
     return calls, names.index(key) if key else 0

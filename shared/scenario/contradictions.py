@@ -65,7 +65,7 @@ def contradictions(
     if link.heartbeat_s != "auto" and link.timeout_s <= link.heartbeat_s:
         yield "link.timeout_s", link.timeout_s, f"more than link.heartbeat_s = {link.heartbeat_s:g}"
     if vehicle.exhausted == "brake" and vehicle.slew_mps2 < vehicle.brake_mps2:
-        least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, for it to brake"
+        least = f"at least vehicle.brake_mps2 = {vehicle.brake_mps2:g}, to allow braking"
         yield "vehicle.slew_mps2", vehicle.slew_mps2, least
     sensor = scenario.sensor
     if sensor.velocity_every_s == "never" and sensor.filter == "none":
@@ -134,7 +134,7 @@ def _no_planner(scenario: Scenario) -> Iterator[Contradiction]:
         yield "control.planner", repr(error.given), error.expected
         return
     if not SCHEMES[schemes.call(control.scheme).name].is_ours:
-        expected = f"{MPC!r} with control.scheme = {control.scheme!r}, which plans itself"
+        expected = f"{MPC!r} with control.scheme = {control.scheme!r}, which has its own planner"
         yield "control.planner", repr(control.planner), expected
 
 

@@ -17,7 +17,7 @@ reference = REFERENCES
 
 
 def circle(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
-    """Circle around the origin, counter-clockwise, from (radius, 0)."""
+    """Circle around the origin, counter-clockwise, starting at (radius, 0)."""
     w = 2.0 * np.pi / period_s
     return planar(
         lambda t: (radius_m * np.cos(w * t), -radius_m * w * np.sin(w * t)),
@@ -28,7 +28,7 @@ def circle(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0)
 
 
 def figure_eight(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
-    """Gerono's lemniscate: 2 radii wide, 1 radius high, from the crossing."""
+    """Gerono's lemniscate: 2 radii wide, 1 radius high, starting at its crossing point."""
     w = 2.0 * np.pi / period_s
     return planar(
         lambda t: (radius_m * np.sin(w * t), radius_m * w * np.cos(w * t)),
@@ -47,6 +47,6 @@ def flown_circle(scenario: Scenario) -> Reference:
 
 @reference(name="figure-eight")
 def flown_figure_eight(scenario: Scenario) -> Reference:
-    """Lemniscate, 2 `radius_m` wide and 1 high, one round in `period_s`."""
+    """Lemniscate, 2 `radius_m` wide and `radius_m` high, one round in `period_s`."""
     config, axes = scenario.reference, scenario.model.axes
     return figure_eight(config.radius_m, config.period_s, axes, config.altitude_m)

@@ -49,8 +49,8 @@ def converged_gain(
     B = np.pad(np.frombuffer(b).reshape(-1, 2), ((0, 0), (0, 1)), constant_values=1.0)
     A = np.pad(np.frombuffer(a).reshape(-1, 2, 2), ((0, 0), (0, 1), (0, 1)))
     Q, R = np.diag([*state_weight, change_weight]), input_weight + change_weight
-    cross = np.array([0.0, 0.0, -change_weight])
     # Cross weight of the input and the previous input in S (u - u(k-1))², halved.
+    cross = np.array([0.0, 0.0, -change_weight])
     cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 3, 3))
     gain = np.zeros_like(B)
     for _ in range(ROUNDS):

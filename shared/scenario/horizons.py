@@ -14,7 +14,7 @@ LOSSY = 0.3
 
 
 def ahead_s(scenario: Scenario) -> float:
-    """Latest time after which a plan is in force, if no packet is late [s]."""
+    """Time until a plan is in force [s]: mean uplink delay, or a longer `control.delay_bound`."""
     control, mean_s = scenario.control, scenario.uplink.mean_s
     if control.properties.flown_as in COMMITTING and control.delay_bound != "auto":
         return max(control.delay_bound, mean_s)

@@ -47,7 +47,7 @@ class Key(msgspec.Struct, frozen=True):
     term: str = ""
     """Field of `Terms` for a key of both ends; empty if it has the key's name."""
     is_decision: bool = False
-    """Whether it is chosen in flight only, and once: no later run of the process repeats it."""
+    """Whether the key is set in flight only, and not set again by a later run of the process."""
 
 
 T = TypeVar("T")

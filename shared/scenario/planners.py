@@ -12,8 +12,8 @@ from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.scenario.schema import Scenario
 
 planner = PLANNERS
-"""Decorator of a planner: a class of a `Problem` and its own numbers with the method `plan`, see
-`Planner`."""
+"""Decorator of a planner: a class made from a `Problem` and its own numbers, with the method
+`plan`, see `Planner`."""
 
 
 class Problem(NamedTuple):

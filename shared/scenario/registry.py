@@ -119,7 +119,7 @@ class Entry:
 
     @property
     def source(self) -> str:
-        """Name of the module of `make`; for a plug-in that is a file, the path."""
+        """Name of the module of `make`, or path of a plug-in that is a file."""
         return self.make.__module__
 
     @property

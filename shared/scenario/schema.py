@@ -142,7 +142,7 @@ class ControlConfig(Section, frozen=True):
     """Whether the vehicle corrects deviations from a horizon's states. A vehicle that can only play
     back inputs needs false, and `input_weight` 3, as in the scenario `playback`."""
     delay_bound: OfServer[Duration | Literal["auto"]] = "auto"
-    """Longest time from the making of a horizon to its flight [s]; auto: as measured."""
+    """Longest time from planning a horizon until it is in force [s]; auto: as measured."""
     observer_s: OfServer[Duration] = 4.0
     """Time constant of the estimate of steady wind and a wrong gain [s]; longer if observations are
     old. 0, or scheme "none": no estimate."""
@@ -182,7 +182,7 @@ class ReferenceConfig(Section, frozen=True):
     shape: Term[Text] = "circle"
     """Shape of the desired trajectory, see `skytether list references`."""
     preview: OfServer[Duration | Literal["all", "none"]] = "all"
-    """Time for which the server knows the desired trajectory ahead [s]; after that, and for a live
+    """Time ahead for which the server knows the desired trajectory [s]; after that, and for a live
     point, it extrapolates."""
     agility: OfServer[Strength] = 0.3
     """Strength of the white acceleration of a target [m/s per √s]."""
@@ -190,7 +190,7 @@ class ReferenceConfig(Section, frozen=True):
     """Mean time between turns of a target [s]; 0: its velocity changes all the time."""
     noise_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
     """Noise of the server's measurement of a target's position at every step [m]; the server
-    filters position and velocity. 0: it knows both."""
+    filters position and velocity. 0: both are exact."""
     radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
     """Half the width of the shape, or of a target's area [m]."""
     period_s: Term[Annotated[float, Meta(ge=0.1, le=86400)]] = 27.5
@@ -436,7 +436,7 @@ class Scenario(Section, frozen=True):
         return network.paths or (PathConfig(uplink=network.uplink, downlink=network.downlink),)
 
     def on_path(self, index: int) -> Self:
-        """Scenario with one path only; the first has the scenario's seed, each other a derived one.
+        """Scenario with one path only; each path except the first has a derived seed.
 
         Args:
             index: number of the path, from 0; the number of paths: network to a standby server.

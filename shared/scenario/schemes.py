@@ -14,7 +14,7 @@ scheme = SCHEMES
 """Decorator of a scheme."""
 
 HELD = "held"
-"""Need of a trigger: the inputs that the vehicle flies if nothing is sent."""
+"""Value of `needs` for a trigger that uses the inputs that are flown if nothing is sent."""
 FIGURES = ("state_gap", "cost_gap", "expected_gap", "deviation_m")
 """Figures of a plan that a scheme may compute; also names of columns in the record."""
 

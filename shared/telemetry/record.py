@@ -62,7 +62,7 @@ class Reason(IntEnum):
     BATTERY = 21, "its battery is low"
     ASTRAY = 22, "its autopilot has no position estimate"
     MUTE = 23, "its autopilot or robot is silent"
-    WAITED = 24, "it has waited too long"
+    WAITED = 24, "it has waited too long for its link, its autopilot or an operator"
     RESUMED = 25, "its process has restarted, and it continues its motion"
     HOMEWARD = 26, "the server has been silent for long"
     RIVAL = 27, "somebody else commands it too"
@@ -99,13 +99,13 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("vehicle", "<u2"),
             ("step", "<i8"),
             ("state", "<f8", (axes, 2)),  # true state [m, m/s]; of a real vehicle, the estimate
-            ("measured", "<f8", (axes, 2)),  # newest since the last step [m, m/s]; NaN if none
-            ("estimate", "<f8", (axes, 2)),  # for feedback and observations, see docs/vehicles.md
+            ("measured", "<f8", (axes, 2)),  # measured since the last step [m, m/s]; NaN if not
+            ("estimate", "<f8", (axes, 2)),  # state used by feedback and observations [m, m/s]
             ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
             ("covered", "?"),  # whether the input is from a horizon: not when hovering or braking
             ("in_force", "<i8"),  # step that the horizon in force was made for; -1 if none is
-            ("age_ns", "<i8"),  # age of that horizon's observation; -1 without one
-            ("stale", "<i8"),  # number of horizons older than the one in force, so far
+            ("age_ns", "<i8"),  # age of the observation of the horizon in force; -1 if none is
+            ("stale", "<i8"),  # number of horizons that arrived after a newer one, so far
             ("missed", "<i8"),  # number of missed steps so far
             ("mode", "<u1"),  # mode from this step on, a `shared.wire.protocol.Mode`
             ("reason", "<u1"),  # reason for the mode, a `Reason`
@@ -137,8 +137,8 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             ("compared", "<u1"),  # figure compared with the threshold, a `Compared`
             ("event", "?"),
             ("solved", "?"),
-            ("solve_ns", "<i8"),  # of both MPCs, for all vehicles; -1 if not measured
-            ("stale", "<i8"),  # number of observations older than the newest, so far
+            ("solve_ns", "<i8"),  # time of both MPCs for all vehicles; -1 if not measured
+            ("stale", "<i8"),  # number of observations that arrived after a newer one, so far
             ("missed", "<i8"),  # number of missed ticks so far
         ]
     )
@@ -219,7 +219,7 @@ class Recorder:
             sink.write(rows.tobytes())
 
     def append_row(self, *values: float) -> None:
-        """Append one row, faster: a value for every column in order, arrays flattened."""
+        """Append one row, faster than `append`: a value for every column, arrays flattened."""
         row = self._row.pack(*values)
         for sink in self._sinks:
             sink.write(row)
@@ -263,7 +263,7 @@ def _row(columns: np.dtype[np.void]) -> Struct:
 
 class FlightEvent(NamedTuple):
     time_ns: int
-    """Time in the flight [ns]: of the world, or over real UDP since the first event."""
+    """Time in the flight [ns]; over real UDP, time since the first event."""
     host: str
     """Host of the event: "server", "netem SEED", "netem SEED/PATH" or "client SEED.VEHICLE"; over
     real UDP the name of the process."""

@@ -27,10 +27,10 @@ class SentBy(NamedTuple):
     """Numbers of plans sent, by cause."""
 
     above: int
-    """Plans sent because the trigger's figure was above its threshold, even if a heartbeat was due
-    too."""
+    """Number of plans sent because the trigger's figure was above its threshold, even if a
+    heartbeat was due too."""
     due: int
-    """Plans sent below the threshold: as a heartbeat, by a schedule, or as the first plan."""
+    """Number of other plans sent: as a heartbeat, by a schedule, or as the first plan."""
 
 
 def sent_by(rows: Rows) -> SentBy:

@@ -23,7 +23,7 @@ sent."""
 WORSE = (Mode.BRAKE, Mode.LAND, Mode.RETURN, Mode.FAULT)
 """Modes in which a vehicle no longer follows its plan because something went wrong."""
 STOPPED = (*WORSE, Mode.HOVER, Mode.INIT, Mode.SYNC, Mode.READY)
-"""Modes that continue a braking manoeuvre: at rest, waiting for a session and for a plan."""
+"""Modes that count as part of a stop that began in a mode of WORSE."""
 
 
 class Summary(msgspec.Struct, frozen=True, kw_only=True):
@@ -96,7 +96,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of failures of a plug-in's code at the server, by its kind; for all vehicles. None
     without the figures of the processes."""
     age_ms_p50: float | None
-    """Age of the observation from which the input being flown was computed [ms], over all steps."""
+    """Median age of the observation from which the flown input was computed, of all steps [ms]."""
     age_ms_p99: float | None
     aoi_s_mean: float | None
     """Mean age of information: the age of the observation from which the input was computed [s],
@@ -116,7 +116,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Share of the steps at which the desired trajectory is faster than u_max times the gain on
     some axis, so that no vehicle can follow it; None if only the server knows the trajectory."""
     solve_ms_p50: float | None
-    """Wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
+    """Median wall-clock time of both MPCs of a step [ms]; None for a virtual flight."""
     solve_ms_p99: float | None
     deadline_misses: int
     """Number of steps missed by server or client."""

@@ -118,9 +118,9 @@ def parse(name: str, content: bytes) -> Keyring:
         key, secret = _key(text, where)
         entry = key.vehicle, key.number
         if entry in keys:
-            raise ConfigError(f"{where}: key {key.number} of vehicle {key.vehicle} again")
+            raise ConfigError(f"{where}: repeated key {key.number} of vehicle {key.vehicle}")
         if (before := lines.setdefault(secret, number)) != number:
-            raise ConfigError(f"{where}: the secret of line {before} again, expected another")
+            raise ConfigError(f"{where}: got the secret of line {before}, expected another")
         counts[key.vehicle] = counts.get(key.vehicle, 0) + 1
         if counts[key.vehicle] > KEYS_MAX:
             expected = f"expected at most {KEYS_MAX}, the present one and the next"

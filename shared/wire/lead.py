@@ -48,7 +48,7 @@ class Lead(NamedTuple):
     number: int
     """Number of the leadership, which only rises; plans with another number are not flown."""
     leads: int
-    """1 if the server of this session leads the vehicle under the number, else 0."""
+    """1 if `number` means that the server of this session leads the vehicle, else 0."""
     largest: int = 0
     """Largest number that the server has received; 0 from a vehicle."""
     step: int = 0

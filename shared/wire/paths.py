@@ -76,14 +76,14 @@ TRIES_MAX = 4
 """Largest number of times that the interval between probes is doubled, on a path that delivers
 packets of the other end but none of this end."""
 DOUBT = 0.5
-"""A path is doubted if a packet on it fails to arrive with more than this probability."""
+"""Probability that a packet on a path does not arrive, above which the path is doubted."""
 DEAD, DEAD_NS = 0.9, SECOND_NS
-"""A path is reported as dead if a packet on it is lost with more than this probability and no
-packet has arrived for this time; the report ends when the path is no longer doubted."""
+"""Probability of loss, and time without an arrival [ns], above which a path is reported as dead,
+until it is no longer doubted."""
 PATIENCE = 3
 """Largest factor on the interval between probes of a path that stays down."""
 ALIKE = 1.25
-"""Paths whose expected cost is within this factor of the least are used in turn."""
+"""Factor on the least expected cost up to which paths are used in turn."""
 ALIVE_WORTH = 40.0
 """Cost, in packets, if the other end considers a working link lost."""
 _SETS = {
@@ -193,7 +193,7 @@ class PathState:
         self.in_flight.clear()
         for packet in waiting:
             if _names(report, arrived, packet.sequence):
-                if packet.is_lost:  # late, not lost: a slower path
+                if packet.is_lost:  # it was not lost, but came late
                     self.delays_ns.clear()
                 self.delays_ns.append(now_ns - packet.sent_ns)
                 self._arrived(packet)
@@ -266,13 +266,13 @@ class Paths:
         self._newest_path: int | None = None
         """Path over which the newest packet arrived."""
         self._awaited: dict[int, int] = {}
-        """Times at which gaps in the other end's packets were noticed, by sequence number."""
+        """Times at which packets of the other end were found missing [ns], by sequence number."""
         self._late_ns = 0
-        """Mean time after which such a packet arrives late [ns]."""
+        """Mean lateness of missing packets that arrived after all [ns]."""
         self._sent_ns = 0
         """Time of the newest packet sent [ns]."""
         self._gaps_ns: deque[int] = deque(maxlen=GAPS)
-        """Newest intervals between messages of the other end."""
+        """Newest intervals between messages of the other end [ns]."""
         self.peer_may_restart = False
         """Whether the other end may restart its sequence numbers."""
         self._before: int | None = None
@@ -331,7 +331,7 @@ class Paths:
         )
 
     def _under_way(self) -> list[int]:
-        """Number of packets on each path since the newest acknowledged one."""
+        """Number of packets in flight on each path, sent after the newest acknowledged one."""
         since_ns = self._arrived_ns()
         return [
             sum(since_ns is None or packet.sent_ns > since_ns for packet in path.in_flight)
@@ -415,7 +415,7 @@ class Paths:
             doubted = path.arrived_ns is None
             if path.missing and path.failure(now_ns) > DOUBT:
                 doubted = True
-                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)  # with growing intervals
+                dear *= min(max(path.missing - OUTAGE, 1), PATIENCE)  # longer after more losses
             since_ns = path.looked_ns if doubted else path.used_ns
             wait_ns = (AGAIN_NS if doubted else LOOK_NS) * dear
             is_back = doubted and path.missing > 0 and path.has_brought

@@ -980,7 +980,7 @@ def test_when_a_vehicle_may_begin_to_land(
 @pytest.mark.parametrize(
     ("goals", "zones_text", "said"),
     [
-        ("1,0,0,0,1\n2,0,0.5,0,9\n", "", "at 0 s side by side, for both may land (vehicle.land_"),
+        ("1,0,0,0,1\n2,0,0.5,0,9\n", "", "at 0 s side by side: both may land (vehicle.land_"),
         ("1,0,0,0,9\n", "box(-1, 1, -1, 1, 0, 2)", "expected none within 0.23 m of the goal"),
     ],
 )

@@ -129,7 +129,7 @@ WRONG = {
     ),
     "an argument that the trigger has not": (
         "control.trigger.cost_gap = 1.0",
-        "control.trigger.cost_gap: got 'expected_gap | heartbeat', expected cost_gap in it",
+        "control.trigger.cost_gap: got 'expected_gap | heartbeat', expected a text with cost_gap",
     ),
     "no argument of a policy": (
         "control.trigger.expected_gap.d = 1.0",

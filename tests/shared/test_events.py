@@ -211,7 +211,7 @@ def test_a_log_of_text_names_its_process_in_every_line(capfd: pytest.CaptureFixt
         "client: vehicle 1: session open, flying",
         "client: counted so far:",
         "client:   missed  3",
-        "client: an error in its code, the flight goes on",
+        "client: an error in its code, the flight continues",
         "client: Traceback:",
         "client: ZeroDivisionError",
     ]

@@ -82,8 +82,8 @@ GOOD = f"1 1 {A.hex()}"
         (GOOD[:-1], "line 1: a secret of 63 characters, expected 64 hexadecimal digits"),
         (GOOD + "a", "line 1: a secret of 65 characters, expected 64 hexadecimal digits"),
         (GOOD[:-1] + "g", "line 1: a secret of 64 characters, expected 64 hexadecimal digits"),
-        (f"{GOOD}\n1 1 {B.hex()}", "line 2: key 1 of vehicle 1 again"),
-        (f"{GOOD}\n2 1 {A.hex()}", "line 2: the secret of line 1 again, expected another"),
+        (f"{GOOD}\n1 1 {B.hex()}", "line 2: repeated key 1 of vehicle 1"),
+        (f"{GOOD}\n2 1 {A.hex()}", "line 2: got the secret of line 1, expected another"),
         (f"{GOOD}\n1 2 {B.hex()}\n1 3 {C.hex()}", "line 3: one more key of vehicle 1"),
     ],
 )

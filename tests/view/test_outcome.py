@@ -97,7 +97,7 @@ def test_what_failed_is_told_once_for_all_vehicles(recording: Path) -> None:
     (leads,) = (each for each in happened if "leads it now" in each)
     assert happened[leads][1] == (1, 2, 3, 4)
     (died,) = (each for each in happened if "nothing arrives over path 1" in each)
-    (healed,) = (each for each in happened if "path 1 (lte) is well again" in each)
+    (healed,) = (each for each in happened if "path 1 (lte) works again" in each)
     assert happened[died][1] == happened[healed][1] == (1, 2)
     assert not any("waits for" in each for each in happened)
     spans = found.dead_paths[1]

@@ -651,7 +651,7 @@ def test_a_gap_in_a_feed_is_told_once(live: tuple[Live, Feeds, list[str]], tmp_p
         feeds.lost("client")
     said = f"{tmp_path / 'live.mcap'}: the recorder could not keep up with client"
     assert made.finish() == said
-    assert complaints == [f"{said}: the record is incomplete, the flight goes on"]
+    assert complaints == [f"{said}: the record is incomplete, the flight continues"]
     assert recorded_steps(tmp_path / "live.mcap") == [1, 3, 5]
 
 
