@@ -77,7 +77,7 @@ class Emulator(Endpoint):
         return Fates(self.link(name).impairments, *at, by_number=self.directions != FLIGHT)
 
     def _open_lanes(self, began_ns: int) -> tuple[Lane, Lane]:
-        """Uplink and downlink of a new flow, whose fates count from `began_ns`."""
+        """Uplink and downlink of a new flow, whose slots count from `began_ns`."""
         flow = self._opened
         self._opened += 1
         up, down = self.fates("uplink", flow), self.fates("downlink", flow)

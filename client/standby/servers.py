@@ -178,7 +178,7 @@ class Servers(OneServer):
         session = self.sessions[server]
         if not session.role.is_followed and session.is_lost(self._now_ns):
             at = address_text(*session.address)
-            return f"{LEADER_KEY}: got {named!r}, but the server at {at} is not heard"
+            return f"{LEADER_KEY}: got {named!r}, but the server at {at} is unreachable"
         if not self.leadership.may_lead(server):
             return f"{LEADER_KEY}: got {named!r}, but {self._limits_differ(server)}"
         return ""

@@ -41,7 +41,7 @@ RECENT = 3
 """Number of newest intervals that count as recent when looking for a step of a clock. If they hold
 fewer than STEP_SAMPLES, because a vehicle reports rarely, more are used, up to OLD."""
 OLD = 8
-"""Age of the minima with which recent ones are compared [intervals]."""
+"""Age of the minima of F and G with which recent minima are compared [intervals]."""
 STEP_SAMPLES = 5
 """Number of samples needed in both recent and old minima to detect a step of a clock."""
 STEP_NS = 40 * MILLISECOND_NS

@@ -16,7 +16,7 @@ class ExtraMissing(ModuleNotFoundError):
 
     def __init__(self, module: str, extra: str) -> None:
         command = f"pip install 'skytether[{extra}]', or in a checkout make setup"
-        super().__init__(f"{module} is not installed, expected it: {command}", name=module)
+        super().__init__(f"{module} is not installed, install it: {command}", name=module)
 
 
 @contextmanager

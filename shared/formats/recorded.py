@@ -97,7 +97,7 @@ def text_in(file: File) -> str:
             raise ValueError(f"cannot be read: {error}") from None
         if not unzip.eof or unzip.unused_data:
             raise ValueError(
-                f"got a truncated file, several, or more than {TEXT_BYTES_MAX} bytes unzipped"
+                f"got a truncated file, several files, or more than {TEXT_BYTES_MAX} bytes unzipped"
             )
     if content[:4] in CAPTURES:
         raise ValueError("got a capture of packets, expected a log")

@@ -172,7 +172,7 @@ def _features(file: str, collection: Any, origin: Origin) -> Iterator[Zone]:
                     return  # too many corners: `geojson` raises the error
         except (KeyError, TypeError, AttributeError, IndexError, ValueError) as error:
             said = isinstance(error, ValueError)
-            expected = str(error) if said else "a feature with a geometry, as RFC 7946 has it"
+            expected = str(error) if said else "a feature with a geometry, as in RFC 7946"
             raise GrammarError(f"{file}: feature {i + 1}", expected) from None
 
 

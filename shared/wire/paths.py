@@ -79,7 +79,7 @@ DOUBT = 0.5
 """Probability that a packet on a path does not arrive, above which the path is doubted."""
 DEAD, DEAD_NS = 0.9, SECOND_NS
 """Probability of loss, and time without an arrival [ns], above which a path is reported as dead,
-until it is no longer doubted."""
+until the probability is at most DOUBT."""
 PATIENCE = 3
 """Largest factor on the interval between probes of a path that stays down."""
 ALIKE = 1.25

@@ -560,5 +560,5 @@ def test_without_dask_a_scheduler_is_refused(
     monkeypatch.setitem(sys.modules, "distributed", None)
     argv = ["sweep", "paper", "--runs", "1", "--out", str(tmp_path), "--scheduler", "tcp://h:1"]
     assert main(argv) == 2
-    said = "distributed is not installed, expected it: pip install 'skytether[cluster]'"
+    said = "distributed is not installed, install it: pip install 'skytether[cluster]'"
     assert capsys.readouterr().err.startswith(f"sweep: {said}")

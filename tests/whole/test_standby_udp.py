@@ -79,7 +79,7 @@ def test_a_server_is_named_as_leader_and_stays_it() -> None:
     ("standby", "reason"),
     [
         (False, "link.leader: got 'standby', expected 'server' without a standby server"),
-        (True, "link.leader: got 'standby', but the server at netem 1/2:0 is not heard"),
+        (True, "link.leader: got 'standby', but the server at netem 1/2:0 is unreachable"),
     ],
 )
 def test_a_server_that_is_not_heard_is_not_made_the_leader(standby: bool, reason: str) -> None:
