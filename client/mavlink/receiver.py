@@ -37,7 +37,7 @@ class Receiver:
 
     def hear(self, message: Message, *, now_ns: int) -> bool:
         """Process a GPS_RAW_INT; returns whether it has a new and usable fix."""
-        stamp_ns = message.time_usec * US_NS or now_ns  # 0: PX4, if the receiver knows no date
+        stamp_ns = message.time_usec * US_NS or now_ns  # 0: PX4, while the date is unknown
         if not _is_usable(message) or stamp_ns == self.stamp_ns:
             return False
         if self._fix_ns is not None and now_ns - self._fix_ns <= INTERVAL_MAX_NS:

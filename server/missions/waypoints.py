@@ -105,7 +105,7 @@ class Waypoints:
         """Close the route ahead of a vehicle until it has another goal; False without another
         route.
 
-        Routes keep `tube_m` from zones, and motions a margin more: between two zones there may be
+        Routes keep `tube_m` from zones, and motions keep more: between two zones there may be
         space for a route but not for a motion.
         """
         way = self._ways_of(vehicle, k).way(place, goal)

@@ -154,7 +154,7 @@ def test_an_autopilot_that_is_not_reached_is_not_flown(way: str) -> None:
     record = flown(network={way: {"loss": 1.0}}, mavlink={"patience_s": 2.0})
     said = {
         "uplink": "vehicle 1: no time told in 2 s: TIMESYNC is not answered",
-        "downlink": "vehicle 1: not heard in 2 s: no heartbeat of an autopilot has arrived",
+        "downlink": "vehicle 1: not heard in 2 s: no heartbeat of an autopilot has come",
     }
     assert str(record.failure) == said[way]
     assert not len(record.client)
