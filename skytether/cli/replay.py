@@ -1,5 +1,6 @@
 """`skytether replay`: play a recording on the page that shows flights."""
 
+import shlex
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -18,7 +19,9 @@ from skytether.view.browser.explaining import Explainer
 from skytether.view.browser.flight import PageFlight
 from skytether.view.browser.replay import Player
 from skytether.view.browser.serve import serve_until_interrupted
+from skytether.view.page import words
 from skytether.view.recordings.outcome import brakes
+from skytether.view.recordings.recorded import Recorded
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,7 @@ def replay(argv: Sequence[str]) -> None:
     options = read(ReplayOptions(tyro.MISSING), argv, "skytether replay", replay.__doc__)
     at = command.address("--page", options.page)
     recorded = recordings.opened(options.file)
-    flight = PageFlight()
+    flight, theorem = PageFlight(), theorem_html(recorded)
     with (
         closing(Player([flight], [recorded.frames])) as player,
         closing(Explainer(options.file, brakes(recorded))) as explainer,
@@ -46,6 +49,9 @@ def replay(argv: Sequence[str]) -> None:
 
         def more(gui: GuiApi) -> Callable[[], None]:
             shows = [add(gui) for add in added]
+            if theorem:
+                with gui.add_folder("Theorem", expand_by_default=False):
+                    gui.add_html(theorem)
 
             def show() -> None:
                 for each in shows:
@@ -54,3 +60,13 @@ def replay(argv: Sequence[str]) -> None:
             return show
 
         serve_until_interrupted(at, [flight], now_ns=player.now_ns, more=more)
+
+
+def theorem_html(recorded: Recorded) -> str:
+    """What the theorem of separation assumes, as HTML; empty unless the flight is a mission."""
+    if not recorded.scenario.keeps_apart:
+        return ""
+    from skytether.theorem.judgement import judged
+
+    text = str(judged(recorded.record, recorded.scenario))
+    return words.explained(text, "", "", shlex.join(["skytether", "explain", recorded.path.name]))

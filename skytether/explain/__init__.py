@@ -21,10 +21,8 @@ The modules, in the order of their use:
 | `smallest` | delta debugging: the smallest set of units that suffices |
 | `causes` | the cause, single packets that would have averted it, how long an outage must be |
 | `remedies` | other keys, over the same network and with other seeds |
-| `hypotheses` | assumptions of a mission's theorem of separation, with their smallest margins |
-| `waits`, `server_ticks` | which vehicle of a mission waited for which, and for which packet |
 | `explanation` | the whole explanation, step by step |
-| `words`, `mission`, `picture` | the explanation as text and as a picture |
+| `words`, `picture` | the explanation as text and as a picture |
 | `command` | the command, the only module with processes, files and the terminal |
 
 **Cause.** A set of units *suffices* if the moment occurs with these units alone: within the window,
@@ -36,7 +34,7 @@ the two is needed.
 
 **Limits.** It explains one flight of a simulated vehicle in simulated wind, or the double of a
 recorded flight, if that is near. A remedy that helps in one flight may fail in others; `--seeds`
-flies others. Of missions over UDP the recording suffices to check the hypotheses.
+flies others. Of missions over UDP the recording suffices for `theorem`.
 
 **Bounds.** Every figure comes from a flight; none is estimated. Every flight goes through `fly`.
 """

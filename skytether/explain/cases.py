@@ -13,16 +13,20 @@ import msgspec
 
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.draws import SLOT_S
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.endpoints.directions import FLIGHT
 from skytether.shared.law.model import Array
-from skytether.shared.scenario import reading
-from skytether.shared.scenario.dotted import set_keys
+from skytether.shared.scenario import dotted, reading
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import UPLINK
 
 Lane: TypeAlias = tuple[int, int, int]
 """Path, direction (UPLINK or DOWNLINK) and flow of packets, each from 0."""
 Keys: TypeAlias = tuple[tuple[str, Any], ...]
 """Keys of a scenario and their values."""
+
+
+ENDS = ("control", "link", "vehicle", "sensor")
+"""Sections whose keys may be what went wrong, if they are not those of the scenario's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +56,11 @@ class UsualDelay:
 
 
 @dataclass(frozen=True, slots=True)
+class Unmet:
+    """What the network would have lost or delayed of packets that this flight did not send."""
+
+
+@dataclass(frozen=True, slots=True)
 class Setting:
     """Property of the scenario, such as wind, that other values of keys remove."""
 
@@ -67,6 +76,7 @@ class Stall:
     at_s: float
     """Time of flight at the beginning [s]."""
     for_s: float
+    """Length [s]; infinite: it is killed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,16 +89,8 @@ class Command:
     value: Any
 
 
-Unit: TypeAlias = Bad | UsualDelay | Setting | Stall | Command
+Unit: TypeAlias = Bad | Unmet | UsualDelay | Setting | Stall | Command
 """Unit that can be removed from a flight."""
-
-
-@dataclass(frozen=True, slots=True)
-class DeliveredStretch:
-    """Stretch in which every packet arrives at most `most_s` after sending [s]."""
-
-    where: Stretch
-    most_s: float
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -121,17 +123,22 @@ class FlightCase:
     secure: bool = False
     stalls: tuple[Stall, ...] = ()
     commands: tuple[Command, ...] = ()
+    overridden: Keys = ()
+    """Keys that differ from those of the scenario's name, with the values that it has there."""
     keys: Keys = ()
-    delivered: tuple[DeliveredStretch, ...] = ()
+    delivered: tuple[tuple[Stretch, float], ...] = ()
+    """Stretches in which every packet arrives, and the longest delay in each [s]."""
     until_s: float | None = None
     """Time of flight at which the flight may end [s]; None: at its regular end."""
     double: Double | None = None
     """Recorded flight of which it is the double; None for a flight in virtual time."""
+    standby: bool = False
+    """Whether there is a standby server, behind a network of its own."""
 
     def fates(self, lane: Lane) -> Fates:
         """Losses and delays of the packets of a lane."""
         path, direction, flow = lane
-        own, name = self.scenario.on_path(path), _name(direction)
+        own, name = self.scenario.on_path(path), FLIGHT[direction]
         return Fates(getattr(own, name), own.seed, name, flow)
 
     def flown(self) -> Scenario:
@@ -139,17 +146,31 @@ class FlightCase:
         scenario = self.scenario
         if self.keys:
             table = reading.to_table(scenario)
-            set_keys(dict(self.keys), table)
+            dotted.set_keys(dict(self.keys), table)
             scenario = reading.check(table, checked=scenario)
         texts = defaultdict[tuple[int, int], list[str]](list)
-        for each in self.delivered:
-            (path, direction, flow), slots = each.where.lane, each.where.end - each.where.first
-            times = f"{each.where.first * SLOT_S:.3f}, {slots * SLOT_S:.3f}, {each.most_s:.6f}"
+        for each, most_s in self.delivered:
+            (path, direction, flow), slots = each.lane, each.end - each.first
+            times = f"{each.first * SLOT_S:.3f}, {slots * SLOT_S:.3f}, {most_s:.6f}"
             texts[path, direction].append(f"{flow}, {times}")
         for (path, direction), stretches in texts.items():
             added = f"delivered({', '.join(stretches)})"
-            scenario = _impaired(scenario, path, _name(direction), added)
+            scenario = _impaired(scenario, path, FLIGHT[direction], added)
         return scenario
+
+
+def overridden(scenario: Scenario, name: str) -> Keys:
+    """Keys of both ends that differ from those of a named scenario, with its values."""
+    try:
+        named = dict(dotted.flat(reading.to_table(reading.load(name))))
+    except ConfigError:  # a recording's scenario, whose file is elsewhere
+        return ()
+    table = dotted.flat(reading.to_table(scenario))
+    return tuple(
+        (key, named[key])
+        for key, own in table
+        if key.partition(".")[0] in ENDS and own != named.get(key, own)
+    )
 
 
 def _impaired(scenario: Scenario, path: int, name: str, added: str) -> Scenario:
@@ -164,7 +185,3 @@ def _impaired(scenario: Scenario, path: int, name: str, added: str) -> Scenario:
         text = getattr(network, name).strip() or "none"
         network = msgspec.structs.replace(network, **{name: f"{text} & {added}"})
     return msgspec.structs.replace(scenario, network=network)
-
-
-def _name(direction: int) -> str:
-    return "uplink" if direction == UPLINK else "downlink"

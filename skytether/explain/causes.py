@@ -5,7 +5,7 @@ flight's beginning on, then also the usual delay. The search uses the first of t
 which the moment does not occur; without such a group, the cause is the scenario.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,6 +19,7 @@ from skytether.explain.cases import (
     Setting,
     Stall,
     Unit,
+    Unmet,
     UsualDelay,
 )
 from skytether.explain.flying import CaseOutcome, FlyAll
@@ -32,8 +33,6 @@ BEFORE_S = 8.0
 horizon and the delays."""
 SHORTEST_MS = 20
 """Accuracy of the length of the shortest outage that suffices [ms]."""
-SETS_MAX = 3
-"""Largest number of sufficient sets that are searched."""
 PACKETS_MAX = 64
 """Largest number of packets, the newest before the moment, whose single delivery is tested."""
 
@@ -72,14 +71,13 @@ class Cause:
     """Number of units that were examined."""
     error_m: float
     """Largest error with this cause alone [m]."""
-    also: tuple[tuple[CausePart, ...], ...] = ()
-    """Further smallest sets, each of which suffices and has no unit of the earlier sets."""
+    averting: tuple[CausePart, ...] = ()
+    """Smallest set without which the moment does not occur; empty if it does not occur without
+    `parts`."""
     others: tuple[CausePart, ...] = ()
-    """Losses and late packets that were examined and are not in any of the sets."""
+    """Losses and late packets that were examined and are in neither set."""
     innocent: tuple[tuple[str, float], ...] = ()
     """Groups of units outside the cause, and the change of the error without each group [m]."""
-    is_all: bool = True
-    """Whether the moment does not occur without all sets together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +86,7 @@ class Packet:
 
     time_s: float
     """Time of flight at which the packet was sent [s]."""
-    path: int
-    direction: int
+    lane: Lane
     is_plan: bool
 
 
@@ -110,6 +107,9 @@ def cause(
     def suffice(cases: Iterable[FlightCase]) -> list[bool]:
         return [comes_about(moment, each) for each in fly_all([*cases])]
 
+    def avert(sets: Sequence[Sequence[Unit]]) -> list[bool]:
+        return [not each for each in suffice(here.without(*some) for some in sets)]
+
     until_s, tried = moment.end_s + AFTER_S, list[tuple[float, Circumstances]]()
     for since_s, with_delay in ((moment.start_s - BEFORE_S, False), (0.0, False), (0.0, True)):
         here = units.circumstances(case, flown, since_s, until_s, with_delay=with_delay)
@@ -119,21 +119,31 @@ def cause(
             if is_averted(moment, bare):
                 break
     if not tried:
-        return Cause((), 0.0, len(here.units), error_m(moment, bare)), here
+        return Cause((), 0.0, len(here.units) - 1, error_m(moment, bare)), here  # but `Unmet`
     since_s, here = tried[-1]
-    sets, rest, still = list[tuple[Unit, ...]](), here.units, True
-    while still and len(sets) < SETS_MAX:
-        found = smallest(rest, lambda some: suffice(map(here.only, some)), at_once)
-        sets.append(found)
-        rest = tuple(each for each in rest if each not in found)
-        taken = [each for each in here.units if each not in rest]
-        # The rest suffices with every other packet delivered, so it contains another set.
-        still = all(suffice([here.without(*taken), here.only(rest)]))
-    (alone,) = fly_all([here.only(sets[0])])
-    first, *also = (tuple(_part(each, flown) for each in found) for found in sets)
-    others = tuple(_part(each, flown) for each in rest if isinstance(each, Bad))
-    counts = max(0.0, since_s), len(here.units), error_m(moment, alone)
-    return Cause(first, *counts, tuple(also), others, is_all=not still), here
+    met = tuple(each for each in here.units if each != Unmet())
+    (is_enough,) = suffice([here.only(met)])
+    every = met if is_enough else here.units
+    found = smallest(every, lambda some: suffice(map(here.only, some)), at_once)
+    alone, without = fly_all([here.only(found), here.without(*found)])
+    averting: tuple[Unit, ...] = ()
+    if comes_about(moment, without):
+        averting = smallest(here.units, avert, at_once)
+    first, second = (
+        tuple(_part(each, flown) for each in _in_order(some)) for some in (found, averting)
+    )
+    others = tuple(
+        _part(each, flown)
+        for each in here.units
+        if isinstance(each, Bad) and each not in (*found, *averting)
+    )
+    counts = max(0.0, since_s), len(met), error_m(moment, alone)
+    return Cause(first, *counts, second, others), here
+
+
+def _in_order(found: Sequence[Unit]) -> list[Unit]:
+    """Units of a set, single packets last: there may be many of them."""
+    return sorted(found, key=lambda each: isinstance(each, Bad) and each.is_packet)
 
 
 def _part(unit: Unit, flown: CaseOutcome) -> CausePart:
@@ -182,7 +192,7 @@ def _groups(found: Cause, here: Circumstances) -> dict[str, list[Unit]]:
     """Units that are not in the cause, by kind."""
     groups: dict[str, list[Unit]] = {}
     for unit in here.units:
-        if all(unit != part.unit for parts in (found.parts, *found.also) for part in parts):
+        if unit != Unmet() and all(unit != part.unit for part in (*found.parts, *found.averting)):
             groups.setdefault(_group(unit), []).append(unit)
     return groups
 
@@ -214,8 +224,11 @@ def named(unit: Unit) -> str:
             return f"usual delay of the {FLIGHT[unit.direction]}"
         case Command():
             return f"change of {unit.key} to {unit.value}"
+        case Unmet():
+            return "what else the network loses"
         case Stall():
-            return f"stall of the {unit.process}"
+            what = "stall" if np.isfinite(unit.for_s) else "death"
+            return f"{what} of the {unit.process}"
         case Bad():
             return f"{WHAT[unit.is_late, unit.is_packet]} of {lane_name(unit.lane)}"
 
@@ -229,25 +242,15 @@ def rescues(
     found: Cause, here: Circumstances, moment: Moment, flown: CaseOutcome, fly_all: FlyAll
 ) -> Rescues:
     """Packets of the cause, sent before the moment, each of which averts it if delivered."""
-    met = {
-        number: part.unit
-        for part in found.parts
-        if isinstance(part.unit, Bad)
-        for number in _met(part.unit, flown)
-        if flown.packets.time_s[number] < moment.start_s
-    }
-    numbers = sorted(met, key=lambda number: flown.packets.time_s[number])[-PACKETS_MAX:]
-    cases = []
-    for number in numbers:
-        lane, slot = flown.packets.lane[number], int(flown.packets.slot[number])
-        cases.append(here.without(Bad(lane, slot, slot + 1)))
+    packets = flown.packets
+    bad = [part.unit for part in found.parts if isinstance(part.unit, Bad)]
+    numbers = sorted(number for unit in bad for number in _met(unit, flown))
+    numbers = [each for each in numbers if packets.time_s[each] < moment.start_s][-PACKETS_MAX:]
+    slots = packets.slot[numbers].tolist()
+    lost = [Bad(packets.lane[at], slot, slot + 1) for at, slot in zip(numbers, slots, strict=True)]
     averting = tuple(
-        Packet(
-            float(flown.packets.time_s[number]),
-            *flown.packets.lane[number][:2],
-            bool(flown.packets.is_plan[number]),
-        )
-        for number, each in zip(numbers, fly_all(cases), strict=True)
+        Packet(float(packets.time_s[at]), packets.lane[at], bool(packets.is_plan[at]))
+        for at, each in zip(numbers, fly_all([*map(here.without, lost)]), strict=True)
         if not comes_about(moment, each)
     )
     return Rescues(averting, len(numbers))

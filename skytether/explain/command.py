@@ -9,27 +9,21 @@ from typing import Annotated
 import numpy as np
 
 from skytether.cli import recordings
-from skytether.explain import doubles, mission, picture
-from skytether.explain.cases import FlightCase
+from skytether.explain import doubles, picture
+from skytether.explain.cases import FlightCase, overridden
 from skytether.explain.explanation import FIRST, STEPS, Explanation, check_same, explain
 from skytether.explain.flying import CaseOutcome, Track, fly
-from skytether.explain.hypotheses import hypotheses
 from skytether.figures import flights as figures
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.record import (
-    PACKET_COLUMNS,
-    RECORDING,
-    FlightEvent,
-    Record,
-    trace_hash,
-)
+from skytether.shared.telemetry.record import RECORDING, trace_hash
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CommandError, ScenarioFlags, ScenarioName
 from skytether.shell.commandline.options import read
 from skytether.shell.host import system
+from skytether.theorem.judgement import judged
 from skytether.view.recordings.recorded import Recorded
 
 
@@ -89,7 +83,10 @@ def explain_flight(argv: Sequence[str]) -> None:
         options = command.parse(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
         vehicles = _vehicles(options)
         command.check_count("--vehicles", vehicles, 255)
-        name, case, recorded = options.scenario, FlightCase(options.config, vehicles), ""
+        case = FlightCase(
+            options.config, vehicles, overridden=overridden(options.config, options.scenario)
+        )
+        name, recorded = options.scenario, ""
     if options.seeds:
         command.check_count("--seeds", options.seeds, 10_000)
     options.pool.check()
@@ -119,12 +116,7 @@ def _judge(options: ExplainOptions, recorded: Recorded) -> None:
     if missing:
         message = f"{recorded.path}: no rows of {', '.join(sorted(missing))}"
         raise CommandError(message, command.CONFIGURATION)
-    events = tuple(FlightEvent(*each) for each in recorded.events())
-    client, server, plan = (recorded.parts[name] for name in ("client", "server", "plan"))
-    no_packets = np.empty(0, PACKET_COLUMNS)
-    own = recorded.figures
-    record = Record(client, server, no_packets, figures=own, events=events, plan=plan)
-    print(mission.text(hypotheses(record, recorded.scenario), ()))
+    print(judged(recorded.record, recorded.scenario))
     print("A flight over UDP cannot be flown again: what caused what is not said.")
 
 
@@ -143,6 +135,7 @@ def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str | Track]:
         recorded.scenario,
         vehicles=len(np.unique(client["vehicle"])),
         secure=recorded.about.secure,
+        overridden=overridden(recorded.scenario, recorded.about.scenario),
     )
     return recorded.about.scenario, case, trace_hash(client)
 

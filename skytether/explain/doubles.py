@@ -15,6 +15,7 @@ elsewhere, and errors of the model.
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
@@ -23,7 +24,7 @@ import numpy as np
 from skytether.explain.cases import Command, Double, FlightCase, Stall
 from skytether.explain.flying import CaseOutcome, Track, track
 from skytether.explain.moments import AROUND_S, Moment
-from skytether.explain.units import DOUBLED, SETTINGS
+from skytether.explain.units import COMPUTING, DOUBLED, SETTINGS
 from skytether.netem.impairments.draws import SLOT_NS, SLOT_S
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -98,7 +99,8 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
     clocks = dict.fromkeys(("simulation.clock_offset_s", "simulation.clock_drift_ppm"), 0.0)
     keys: dict[str, Any] = {"simulation.compute_s": compute_ns / SECOND_NS, **clocks}
     if scenario.vehicle.kind not in SIMULATED:
-        keys |= {key: value for _, changes in SETTINGS[:-1] for key, value in changes}
+        gone = (changes for name, changes in SETTINGS if name != COMPUTING)
+        keys |= dict(chain.from_iterable(gone))
         keys["vehicle.kind"] = DOUBLED
     # Just before step 0, whose lateness has this time, the vehicle is in the air.
     late_ns[0][began_ns - zero_ns - 1] = 1

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import msgspec
 
-from skytether.explain import causes, mission, remedies, units, words
+from skytether.explain import causes, remedies, units, words
 from skytether.explain.cases import FlightCase
 from skytether.explain.causes import Cause, Rescues
 from skytether.explain.doubles import Nearness, nearness
@@ -50,8 +50,7 @@ class Explanation:
         said = words.text(self.moments, self.moment, self.cause, self.rescues, self.remedies)
         if self.nearness is not None:
             said = f"A double of the flight, {self.nearness}:\n{said}"
-        of_mission = mission.text(self.flown.hypotheses, self.flown.waits)
-        return f"{said}\n\n{of_mission}" if of_mission else said
+        return f"{said}\n\n{of_mission}" if (of_mission := self.flown.judgement) else said
 
     def to_json(self, following: str = "") -> bytes:
         """The explanation so far, as JSON: fields without flights, figures of a mission, text, and
@@ -59,7 +58,7 @@ class Explanation:
         """
         names = "name", "seed", "moments", "moment", "nearness", "cause", "rescues", "remedies"
         fields = {name: getattr(self, name) for name in names}
-        fields |= {name: getattr(self.flown, name) for name in ("hypotheses", "waits")}
+        fields |= {"judgement": self.flown.judgement}
         return msgspec.json.encode({**fields, "text": str(self), "next": following})
 
 

@@ -3,6 +3,7 @@
 A case and its outcome can be sent to another process and back.
 """
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -12,21 +13,20 @@ import numpy as np
 
 from skytether.explain import doubled
 from skytether.explain.cases import FlightCase, Lane, Stall
-from skytether.explain.hypotheses import Hypothesis, hypotheses
-from skytether.explain.server_ticks import are_plans, flows
-from skytether.explain.waits import Reason, Wait, waits
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Failure, FlowOpened, Flying
 from skytether.shared.events.paths import PathDied
 from skytether.shared.law.model import Array, Flags, Indices
-from skytether.shared.law.motion import SPACING
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK, Record, Rows, trace_hash
+from skytether.shared.telemetry.server_ticks import are_plans, flows
 from skytether.shared.telemetry.summary import position_error, separations
 from skytether.shared.wire.protocol import Mode
 from skytether.sim import flight
 from skytether.sim.world import World
+from skytether.theorem.judgement import Judgement, judged
+from skytether.theorem.waits import Reason, questions
 
 JUST_NS, BEFORE_NS = SECOND_NS // 5, 2 * SECOND_NS
 """Least and largest age of packets by which it is judged whether a path was dead [ns]: those that
@@ -101,10 +101,9 @@ class CaseOutcome:
     packets_per_s: float
     trace: str
     """Hash of the vehicles' rows, see `trace_hash`."""
-    hypotheses: tuple[Hypothesis, ...] = ()
-    """Assumptions of the theorem of separation, and whether they held; empty without a mission."""
-    waits: tuple[Wait, ...] = ()
-    """Waits of a mission's vehicles, the longest first."""
+    judgement: Judgement | None = None
+    """Whether what the theorem of separation assumes held, and who waited; None unless on a
+    mission."""
 
 
 FlyAll: TypeAlias = Callable[[Sequence[FlightCase]], list[CaseOutcome]]
@@ -125,12 +124,13 @@ def fly(case: FlightCase) -> CaseOutcome:
     if case.double is not None:
         actions += doubled.actions(case.double, scenario)
     if scenario.keeps_apart:
-        actions += _questions(scenario, reasons)
+        actions += questions(scenario, reasons)
     record = flight.fly(
         scenario,
         vehicles=case.vehicles,
         secure=case.secure,
         changes=[(each.at_s, {each.key: each.value}) for each in case.commands],
+        standby=case.standby,
         actions=actions,
         on_second=on_second,
         stopped=None if until_s is None else lambda: reached_s >= until_s,
@@ -138,27 +138,13 @@ def fly(case: FlightCase) -> CaseOutcome:
     return outcome(scenario, record, reasons)
 
 
-def _questions(
-    scenario: Scenario, reasons: list[Reason]
-) -> Iterator[tuple[float, Callable[[World], None]]]:
-    """Times at which the server's reasons for waiting are read, one for each decision."""
-
-    def ask(world: World) -> None:
-        for vehicle, figures in world.endpoint(flight.SERVER[0]).figures()["by_vehicle"].items():
-            time_s = world.now_ns / SECOND_NS
-            reasons.append((time_s, int(vehicle), figures.get("waits") or ""))
-
-    every_s = SPACING * scenario.control.dt
-    for number in range(int((scenario.link.connect_s + scenario.duration) / every_s)):
-        yield number * every_s, ask
-
-
 def _actions(stall: Stall, case: FlightCase) -> Iterable[tuple[float, Callable[[World], None]]]:
     seed, vehicles = case.scenario.seed, range(1, case.vehicles + 1)
     clients = [f"client {seed}.{vehicle}" for vehicle in vehicles]
     for host in ["server"] if stall.process == "server" else clients:
         yield stall.at_s, partial(World.freeze, name=host)
-        yield stall.at_s + stall.for_s, partial(World.thaw, name=host)
+        if math.isfinite(stall.for_s):
+            yield stall.at_s + stall.for_s, partial(World.thaw, name=host)
 
 
 def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) -> CaseOutcome:
@@ -191,8 +177,7 @@ def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) 
         tuple(_deaths(record)),
         len(record.netem) / max(1.0, float(np.ptp(record.netem["arrived_ns"])) / SECOND_NS),
         trace_hash(record.client),
-        hypotheses(record, scenario) if scenario.keeps_apart else (),
-        waits(record, scenario, reasons) if scenario.keeps_apart else (),
+        judged(record, scenario, reasons) if scenario.keeps_apart else None,
     )
 
 

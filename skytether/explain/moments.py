@@ -157,33 +157,22 @@ def _of_vehicle(track: Track, usual: Track | None, scenario: Scenario) -> Iterat
     step_mps = scenario.control.dt * float(np.max(scenario.u_max * scenario.true_gain))
     bound = FAR_TIMES * normal + FAR_STEPS * step_mps
     is_far = (error > bound) & (track.step_s >= scenario.settled_s)
+
+    def moment(kind: Kind, says: str, first: int, end: int, until: int) -> Moment:
+        start_s, end_s = time_s[[first, end - 1]].tolist()
+        figures = float(error[first:until].max()), float(normal[first:until].max())
+        levels = (1.0, 0.0) if kind == "brake" else _levels(*figures)
+        return Moment(kind, track.vehicle, start_s, end_s, says, *figures, *levels)
+
     for first, end in braked:
-        until = np.searchsorted(time_s, time_s[end - 1] + AFTER_S)
+        until = int(np.searchsorted(time_s, time_s[end - 1] + AFTER_S))
         says = f"{DOES[Mode(track.mode[first])]} ({Reason(track.reason[first])})"
-        at = first, end, says, error[first:until], normal[first:until]
-        yield _moment("brake", track, *at, (1.0, 0.0))
+        yield moment("brake", says, first, end, until)
         is_far[first:until] = False
     gap = np.ones(2 * round(PAUSE_S / scenario.control.dt) + 1)
     goes_on = np.convolve(error > bound / 2.0, gap, "same") > 0.5
     for first, end in _runs(is_far, goes_on):
-        own, usual_m = error[first:end], normal[first:end]
-        levels = _levels(float(own.max()), float(usual_m.max()))
-        yield _moment("error", track, first, end, "was far off", own, usual_m, levels)
-
-
-def _moment(
-    kind: Kind,
-    track: Track,
-    first: int,
-    end: int,
-    says: str,
-    own: Array,
-    usual: Array,
-    levels: tuple[float, float],
-) -> Moment:
-    start_s, end_s = track.time_s[[first, end - 1]].tolist()
-    figures = float(own.max()), float(usual.max())
-    return Moment(kind, track.vehicle, start_s, end_s, says, *figures, *levels)
+        yield moment("error", "was far off", first, end, end)
 
 
 def _levels(figure: float, usual: float) -> tuple[float, float]:

@@ -74,8 +74,8 @@ def _stretches(known: Explanation) -> tuple[list[CausePart], list[CausePart]]:
     cause = known.cause
     if cause is None:
         return [], []
-    sets = (cause.parts, *cause.also)
-    return [part for each in sets for part in each if isinstance(part.unit, Bad)], [*cause.others]
+    found = (*cause.parts, *cause.averting)
+    return [part for part in found if isinstance(part.unit, Bad)], [*cause.others]
 
 
 def _draw_lanes(axes: "Axes", known: Explanation, lanes: list[Lane]) -> None:

@@ -15,13 +15,13 @@ from skytether.explain.cases import Bad, FlightCase, Keys, Setting, Stall, Unit,
 from skytether.explain.causes import Cause
 from skytether.explain.flying import CaseOutcome, FlyAll
 from skytether.explain.moments import Moment, comes_about, error_m
-from skytether.shared.base.errors import ConfigError
+from skytether.explain.units import is_possible
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.shared.telemetry.summary import WORSE
 from skytether.shared.wire.protocol import INPUTS_MAX
 
-AS_FLOWN = "as flown"
+AS_FLOWN, STANDBY = "as flown", "a standby server"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def remedies(
 ) -> tuple[list[Remedy], list[CaseOutcome]]:
     """Fly each remedy; the first result is the explained flight, unchanged."""
     tried = [(AS_FLOWN, Keys()), *possible(found, case)]
-    outcomes = fly_all([replace(case, keys=keys, until_s=None) for _, keys in tried])
+    outcomes = fly_all([_with(case, *each) for each in tried])
     flown = [
         Remedy(
             name,
@@ -75,17 +75,19 @@ def remedies(
 
 def with_others(each: Remedy, case: FlightCase, seeds: Sequence[int], fly_all: FlyAll) -> Remedy:
     """Add the means over flights of other seeds to a remedy."""
-    scenario = case.scenario
-    cases = [
-        replace(case, keys=each.keys, scenario=msgspec.structs.replace(scenario, seed=seed))
-        for seed in seeds
-    ]
+    scenario, case = case.scenario, _with(case, each.name, each.keys)
+    cases = [replace(case, scenario=msgspec.structs.replace(scenario, seed=seed)) for seed in seeds]
     outcomes = fly_all(cases)
     means = (
         float(np.mean([figure(outcome) for outcome in outcomes]))
         for figure in (brakes, lambda one: _largest_m(one, scenario), lambda one: one.packets_per_s)
     )
     return replace(each, elsewhere=Elsewhere(len(outcomes), *means))
+
+
+def _with(case: FlightCase, name: str, keys: Keys) -> FlightCase:
+    """Whole flight with a remedy."""
+    return replace(case, keys=keys, standby=case.standby or name == STANDBY, until_s=None)
 
 
 def brakes(outcome: CaseOutcome) -> int:
@@ -102,13 +104,13 @@ def _largest_m(outcome: CaseOutcome, scenario: Scenario) -> float:
 def possible(found: Cause, case: FlightCase) -> Iterator[tuple[str, Keys]]:
     """Names and keys of remedies that the scenario can be flown with."""
     for name, keys in _listed([part.unit for part in found.parts], case.scenario):
-        if case.double and any(key == "network.paths" for key, _ in keys):
+        if case.double and (name == STANDBY or any(key == "network.paths" for key, _ in keys)):
             continue  # a second network is not recorded
-        try:
-            changed = replace(case, keys=keys).flown()
-        except ConfigError:
+        if not is_possible(case, keys):
             continue
-        if changed != case.scenario:
+        if replace(case, keys=keys).flown() != case.scenario or (
+            name == STANDBY and not case.standby
+        ):
             yield name, keys
 
 
@@ -153,7 +155,10 @@ def _listed(units: Sequence[Unit], scenario: Scenario) -> Iterator[tuple[str, Ke
         yield _key("sensor.filter", "kalman")
     if any("model" in name for name in names):
         yield "the model identified", _identified(scenario)
-    if any(isinstance(each, Stall) for each in units):
+    stalled = {each.process for each in units if isinstance(each, Stall)}
+    if "server" in stalled:
+        yield STANDBY, Keys()
+    if stalled:
         yield _key("link.timeout_s", 2.0 * link.timeout_s)
 
 

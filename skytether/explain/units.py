@@ -7,23 +7,28 @@ packet is a unit.
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain, combinations
 
 import msgspec
 import numpy as np
 
 from skytether.explain.cases import (
     Bad,
-    DeliveredStretch,
     FlightCase,
     Keys,
     Lane,
     Setting,
     Stretch,
     Unit,
+    Unmet,
     UsualDelay,
 )
 from skytether.explain.flying import CaseOutcome
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import dotted, reading
 from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 
 OUTAGE_MS = 50
 """Shortest stretch without a good slot that is an outage [ms]: by chance, independent losses of
@@ -34,16 +39,11 @@ SPREAD = 3.0
 """A packet is late beyond the median delay by this multiple of the distance to the upper quartile.
 """
 
-WIND = "wind"
+KEYS_MAX = 5
+"""Largest number of overridden keys that are units by themselves: all combinations are checked."""
+
+WIND, COMPUTING = "wind", "the server's computing time"
 SETTINGS: Sequence[tuple[str, Keys]] = (
-    (
-        WIND,
-        (
-            ("vehicle.wind", 0.0),
-            ("vehicle.steady_wind_mps", ()),
-            ("vehicle.turbulence_mps", 0.0),
-        ),
-    ),
     ("gusts", (("vehicle.gust_mps2", 0.0),)),
     (
         "errors of the sensors",
@@ -60,9 +60,18 @@ SETTINGS: Sequence[tuple[str, Keys]] = (
         "a vehicle that differs from its model",
         (("vehicle.tau_s", ()), ("vehicle.gain", ()), ("vehicle.dead_time_s", ())),
     ),
-    ("the server's computing time", (("simulation.compute_s", 0.001),)),
+    (COMPUTING, (("simulation.compute_s", 0.001),)),
+    (
+        WIND,
+        (
+            ("vehicle.wind", 0.0),
+            ("vehicle.steady_wind_mps", ()),
+            ("vehicle.turbulence_mps", 0.0),
+        ),
+    ),
 )
-"""Properties of vehicle, wind and server, and values of keys that remove them."""
+"""Properties of vehicle, wind and server, and values of keys that remove them; wind, which most
+flights have, is last."""
 DOUBLED = "doubled(1)"
 """Kind of the vehicle in place of a real one, see `doubled`."""
 PUSH = Setting("wind and errors of the model", (("vehicle.kind", "doubled(0)"),))
@@ -75,7 +84,7 @@ def perfect(case: FlightCase) -> FlightCase:
     network, none = case.scenario.network, {"uplink": "none", "downlink": "none"}
     paths = tuple(msgspec.structs.replace(each, **none) for each in network.paths)
     network = msgspec.structs.replace(network, **none, paths=paths)
-    settings = (keys for name, keys in SETTINGS if name != WIND and _is_there(case.scenario, keys))
+    settings = [each.keys for each in _settings(case) if each.name != WIND]
     return replace(
         case,
         scenario=msgspec.structs.replace(case.scenario, network=network),
@@ -98,46 +107,30 @@ class Circumstances:
     """Longest usual delay of a path and direction [s]."""
 
     def without(self, *taken: Unit) -> FlightCase:
-        """Case of the flight without these units."""
-        delivered = [
-            DeliveredStretch(each, self._most_s(each.lane, taken))
-            for each in taken
-            if isinstance(each, Bad)
-        ]
+        """Case of the flight without these units, or without parts of them."""
         directions = {each.direction for each in taken if isinstance(each, UsualDelay)}
+        if Unmet() in taken:
+            directions = {UPLINK, DOWNLINK}
+        bad = [each for each in taken if isinstance(each, Bad) and each.lane[1] not in directions]
         left = [each for each in self.units if isinstance(each, Bad) and each not in taken]
-        delivered += [
-            DeliveredStretch(each, 0.0)
-            for stretch in self.window
-            if stretch.lane[1] in directions
-            for each in _between(stretch, left)
-        ]
-        return self._with(delivered, taken)
-
-    def only(self, kept: Collection[Unit]) -> FlightCase:
-        """Case of the flight with these units only; other packets in the window are delivered."""
-        taken = [each for each in self.units if each not in kept]
-        bad = [each for each in kept if isinstance(each, Bad)]
-        delivered = [
-            DeliveredStretch(each, self._most_s(each.lane, taken))
-            for stretch in self.window
-            for each in _between(stretch, bad)
-        ]
-        return self._with(delivered, taken)
-
-    def _most_s(self, lane: Lane, taken: Collection[Unit]) -> float:
-        return 0.0 if UsualDelay(lane[1]) in taken else self.usual_s[lane[:2]]
-
-    def _with(self, delivered: Sequence[DeliveredStretch], taken: Collection[Unit]) -> FlightCase:
-        keys = [key for each in taken if isinstance(each, Setting) for key in each.keys]
+        between = (_between(each, left) for each in self.window if each.lane[1] in directions)
+        delivered = tuple(
+            (each, 0.0 if UsualDelay(each.lane[1]) in taken else self.usual_s[each.lane[:2]])
+            for each in (*bad, *chain.from_iterable(between))
+        )
+        keys = tuple(key for each in taken if isinstance(each, Setting) for key in each.keys)
         own = self.case
         return replace(
             own,
-            delivered=tuple(delivered),
-            keys=tuple(keys),
+            delivered=delivered,
+            keys=keys,
             stalls=tuple(each for each in own.stalls if each not in taken),
             commands=tuple(each for each in own.commands if each not in taken),
         )
+
+    def only(self, kept: Collection[Unit]) -> FlightCase:
+        """Case of the flight with these units only; other packets in the window are delivered."""
+        return self.without(*(each for each in self.units if each not in kept))
 
 
 def _between(stretch: Stretch, bad: Collection[Bad]) -> Iterator[Stretch]:
@@ -168,11 +161,11 @@ def circumstances(
         usual_s.setdefault(lane[:2], _usual_s(flown, lane))
         window.append(stretch)
         bad += _bad(case, flown, stretch, usual_s[lane[:2]])
-    settings = [Setting(*each) for each in SETTINGS if _is_there(case.scenario, each[1])]
+    settings = [*_settings(case)]
     if case.scenario.vehicle.kind == DOUBLED:
         settings.append(PUSH)
     delays = [UsualDelay(direction) for direction in (1, 0)] if with_delay else []
-    found = *settings, *delays, *case.stalls, *case.commands, *bad
+    found = *settings, *delays, Unmet(), *case.stalls, *case.commands, *bad
     return Circumstances(case, found, tuple(window), usual_s)
 
 
@@ -191,6 +184,29 @@ def _usual_s(flown: CaseOutcome, lane: Lane) -> float:
         return 0.0
     half, upper = np.quantile(delays_s, (0.5, 0.75))
     return float(half + SPREAD * (upper - half))
+
+
+def _settings(case: FlightCase) -> Iterator[Setting]:
+    """Overridden keys of a scenario, and what of SETTINGS it has."""
+    listed = {key for _, keys in SETTINGS for key, _ in keys}
+    keys = tuple(each for each in case.overridden if each[0] not in listed)
+    some = [each for count in range(1, len(keys)) for each in combinations(keys, count)]
+    is_each = len(keys) <= KEYS_MAX and all(map(partial(is_possible, case), some))
+    for each in [(key,) for key in keys] if is_each else [keys]:  # or they belong together
+        if keys and is_possible(case, keys):
+            table = reading.to_table(case.scenario)
+            names = (f"{key} = {dotted.value(table, key)}" for key, _ in each)
+            yield Setting(", ".join(names), each)
+    yield from (Setting(*each) for each in SETTINGS if _is_there(case.scenario, each[1]))
+
+
+def is_possible(case: FlightCase, keys: Keys) -> bool:
+    """Whether a case can be flown with these keys."""
+    try:
+        replace(case, keys=keys).flown()
+    except ConfigError:
+        return False
+    return True
 
 
 def _is_there(scenario: Scenario, keys: Keys) -> bool:

@@ -5,10 +5,11 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import groupby
 
-from skytether.explain.cases import Bad
+from skytether.explain.cases import Bad, Unit
 from skytether.explain.causes import WHAT, Cause, CausePart, Rescues, lane_name, named
 from skytether.explain.moments import Moment
 from skytether.explain.remedies import Remedy
+from skytether.shared.endpoints.directions import FLIGHT
 from skytether.shared.telemetry.record import UPLINK
 
 RESCUES_SHOWN = 8
@@ -73,13 +74,13 @@ def _cause(cause: Cause, moment: Moment) -> Iterator[str]:
         f"{this}: without {_units(others, 'other')} {since}, it comes about all the same"
         f"{_off(cause.error_m)}."
     )
-    for parts in cause.also:
-        suffice = "suffice" if len(parts) > 1 else "suffices"
-        yield f"Or: {_joined(_counted(parts))}, which {suffice} as well."
-        yield from _table(parts, moment)
-    if cause.also:
-        without = "it does not come about" if cause.is_all else "it comes about all the same"
-        yield f"Without all of them {without}."
+    if cause.averting:
+        its = "it" if len(cause.parts) == 1 else "them"
+        yield (
+            f"Without {its}, other units suffice. It is averted without "
+            f"{_joined(_counted(cause.averting))}:"
+        )
+        yield from _table(cause.averting, moment)
 
 
 def _table(parts: Sequence[CausePart], moment: Moment) -> Iterator[str]:
@@ -97,22 +98,20 @@ def _units(count: int, other: str = "") -> str:
 
 def _counted(parts: Iterable[CausePart]) -> list[str]:
     """Nouns of parts with their number, such as "2 outages of the uplink"."""
-    nouns = Counter(
-        f"{WHAT[part.unit.is_late, part.unit.is_packet]}|of the {_way(part.unit)}"
-        if isinstance(part.unit, Bad)
-        else f"{named(part.unit)}|"
-        for part in parts
-    )
-    said = []
-    for noun, count in nouns.items():
-        what, _, where = noun.partition("|")
-        many = f"{count} {what}s" if where else what
-        said.append(f"{many if count > 1 else f'one {what}' if where else what} {where}".strip())
-    return said
+    nouns = Counter(_noun(part.unit) for part in parts)
+    return [
+        " ".join(
+            [f"{count} {what}s" if count > 1 else f"one {what}" if where else what, where]
+        ).strip()
+        for (what, where), count in nouns.items()
+    ]
 
 
-def _way(unit: Bad) -> str:
-    return ("uplink", "downlink")[unit.lane[1]]
+def _noun(unit: Unit) -> tuple[str, str]:
+    """Noun and direction, which is empty for what there is one of."""
+    if not isinstance(unit, Bad):
+        return named(unit), ""
+    return WHAT[unit.is_late, unit.is_packet], f"of the {FLIGHT[unit.lane[1]]}"
 
 
 def _kind(part: CausePart) -> object:
@@ -127,6 +126,8 @@ def _row(parts: Sequence[CausePart], moment: Moment) -> list[str]:
     unit, plans = first.unit, sum(part.plans for part in parts)
     times = dict.fromkeys(f"{each:.1f}" for each in (first.start_s, first.end_s))
     when = f"{' to '.join(times)} s" if first.end_s else ""
+    if math.isinf(first.end_s):
+        when = f"at {first.start_s:.1f} s"
     if not isinstance(unit, Bad):
         return [named(unit), when, "", "", _without(parts, moment)]
     verb, packets = "late" if unit.is_late else "lost", first.packets

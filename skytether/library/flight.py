@@ -18,23 +18,18 @@ from skytether.figures import flights as figures
 from skytether.shared.base import extras
 from skytether.shared.base.errors import ConfigError, FlightError, RecordingError
 from skytether.shared.base.hint import hint
-from skytether.shared.events.flight import Event, Failure, RecordIncomplete, VehicleEvent
+from skytether.shared.events.flight import Failure
 from skytether.shared.scenario.whole import Scenario
-from skytether.shared.telemetry.feed import Figures, Said
 from skytether.shared.telemetry.record import (
-    PACKET_COLUMNS,
     RECORDING,
     FlightEvent,
     Record,
-    client_columns,
-    plan_columns,
-    server_columns,
     trace_hash,
 )
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary, desired, summarise
 from skytether.shell.commandline import terminal
-from skytether.view.rows import Columns, arrays, readable
+from skytether.view.rows import Columns, arrays, no_rows, readable
 
 if TYPE_CHECKING:
     import pandas
@@ -79,7 +74,7 @@ class Flight:
         self.secure = secure
         """Whether the link was encrypted."""
         # A part without rows gets empty columns, so that its arrays exist.
-        parts: dict[str, Any] = {**_no_rows(scenario)}
+        parts: dict[str, Any] = {**no_rows(scenario)}
         parts |= {part: rows for part in PARTS if len(rows := getattr(record, part))}
         events = tuple(each._replace(host=each.process) for each in record.events)
         self.record = replace(record, **parts, events=events)
@@ -151,11 +146,16 @@ class Flight:
         Raises:
             ConfigError: the flight cannot be reproduced, or has no moment at that time.
         """
-        from skytether.explain.cases import FlightCase
+        from skytether.explain.cases import FlightCase, overridden
         from skytether.explain.explanation import STEPS, explained
 
         client = self.record.client
-        case = FlightCase(self.scenario, len(np.unique(client["vehicle"])) or 1, self.secure)
+        case = FlightCase(
+            self.scenario,
+            len(np.unique(client["vehicle"])) or 1,
+            self.secure,
+            overridden=overridden(self.scenario, self.name),
+        )
         began_s = time.monotonic()
         with ExitStack() as stack:
             bar: terminal.Bar | None = None
@@ -244,28 +244,9 @@ class Flight:
         """
         from skytether.view.recordings.recorded import read
 
-        events: list[FlightEvent] = []
-        figures: dict[str, Any] = {}
         recorded = read(Path(path))
-        for time_ns, process, frame in recorded.frames:
-            match frame:
-                case Said():
-                    events.append(FlightEvent(time_ns, process, frame.event))
-                case Figures():
-                    figures[process] = frame.figures
-        parts: dict[str, Any] = _no_rows(recorded.scenario)
-        parts |= {part: rows for part, rows in recorded.parts.items() if part in PARTS}
-        parts["netem"]["arrived_ns"] -= recorded.begin_ns
-        log_events = [each.event for each in events]
-        record = Record(
-            **parts,
-            failure=_failure(events),
-            figures=figures,
-            events=tuple(events),
-            incomplete=tuple(event for event in log_events if isinstance(event, RecordIncomplete)),
-        )
         about = recorded.about
-        return cls(recorded.scenario, record, name=about.scenario, secure=about.secure)
+        return cls(recorded.scenario, recorded.record, name=about.scenario, secure=about.secure)
 
     def __repr__(self) -> str:
         steps, seconds = len(self.record.client), self.summary.duration_s
@@ -296,24 +277,3 @@ def values(summary: Summary) -> dict[str, Any]:
     """Single-valued fields of a summary: all but the tables `modes` and `drops`."""
     fields = msgspec.structs.asdict(summary)
     return {name: value for name, value in fields.items() if name not in ("modes", "drops")}
-
-
-def _no_rows(scenario: Scenario) -> dict[str, Table]:
-    axes = scenario.model.axes
-    return {
-        "client": np.empty(0, client_columns(axes)),
-        "server": np.empty(0, server_columns(axes, scenario.control.scheme)),
-        "netem": np.empty(0, PACKET_COLUMNS),
-        "plan": np.empty(0, plan_columns(axes, scenario.control.horizon)),
-    }
-
-
-def _failure(events: list[FlightEvent]) -> Failure | None:
-    """Failure of the first vehicle, by number, whose last event is one; None without any."""
-    last: dict[int, Event] = {
-        each.event.vehicle: each.event
-        for each in events
-        if each.process == "client" and isinstance(each.event, VehicleEvent)
-    }
-    ends = (event for _, event in sorted(last.items()))
-    return next((event for event in ends if isinstance(event, Failure)), None)

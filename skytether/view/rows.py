@@ -237,3 +237,14 @@ def planned(scenario: Scenario, row: np.void) -> Array:
     """
     inputs = row["inputs"] + row["disturbance"][:, np.newaxis]
     return scenario.terms().model.roll(row["state"], inputs)[:, :, 0]
+
+
+def no_rows(scenario: Scenario) -> dict[str, Rows]:
+    """Parts of a record without rows."""
+    axes = scenario.model.axes
+    return {
+        "client": np.empty(0, client_columns(axes)),
+        "server": np.empty(0, server_columns(axes, scenario.control.scheme)),
+        "netem": np.empty(0, PACKET_COLUMNS),
+        "plan": np.empty(0, plan_columns(axes, scenario.control.horizon)),
+    }

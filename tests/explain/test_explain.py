@@ -12,7 +12,7 @@ import pytest
 
 import skytether
 from skytether.explain import moments, picture, units
-from skytether.explain.cases import Bad, FlightCase, Setting, Stall, UsualDelay
+from skytether.explain.cases import Bad, FlightCase, Setting, Stall, UsualDelay, overridden
 from skytether.explain.explanation import Explanation, _chosen, explain, explained
 from skytether.explain.flying import CaseOutcome, fly
 from skytether.explain.moments import Moment, comes_about
@@ -127,6 +127,9 @@ def test_packets_lost_one_after_another_are_the_cause_together() -> None:
     assert len(known.rescues.packets) > 10
 
 
+KILLED = Stall("server", 15.0, np.inf)
+
+
 def made() -> dict[str, FlightCase]:
     """Flights in which one known thing is wrong."""
     good = flight("demo", 13, f"{SHORT} & loss(0.05)")
@@ -135,12 +138,15 @@ def made() -> dict[str, FlightCase]:
         return flight("demo", 17, f"{SHORT} & loss(0.05)", **keys)
 
     gusts = {"vehicle.gust_mps2": 3.0, "vehicle.gust_every_s": 12.0}
+    impatient = flight("demo", 13, SHORT, **{"link.timeout_s": 0.3})
     noise = {"sensor.position_noise_m": 0.6, "sensor.filter": "none"}
     return {
         "outage up": flight("demo", 11, f"{SHORT} & outage(14, 3)", SHORT),
         "outage down": flight("demo", 12, SHORT, f"{SHORT} & outage(14, 8)"),
         "server": replace(good, stalls=(Stall("server", 15.0, 3.0),)),
         "client": replace(good, stalls=(Stall("client", 15.0, 1.0),)),
+        "killed": replace(good, stalls=(KILLED,)),
+        "key": replace(impatient, overridden=overridden(impatient.scenario, "demo")),
         "gain": other(**{"vehicle.gain": 0.4}),
         "gusts": other(**gusts),
         "noise": other(**noise),
@@ -154,6 +160,8 @@ EXPECTED: dict[str, tuple[object, ...]] = {
     "outage down": (DOWNLINK,),
     "server": (Stall("server", 15.0, 3.0),),
     "client": (Stall("client", 15.0, 1.0),),
+    "killed": (KILLED,),
+    "key": ("link.timeout_s = 0.3",),
     "gain": ("a vehicle that differs from its model",),
     "gusts": ("gusts",),
     "noise": ("errors of the sensors",),
@@ -175,6 +183,40 @@ def test_what_was_broken_is_named(what: str) -> None:
         for part in cause.parts
     )
     assert found == EXPECTED[what]
+
+
+def test_what_has_to_go_is_listed_if_other_units_suffice_as_well() -> None:
+    """The server is not heard, or hears nothing: either makes the vehicle brake."""
+    own = flight("demo", 11, f"{SHORT} & outage(14, 9)")
+    known = up_to("what is needed", own)
+    assert known.cause
+    assert known.moment
+    first, second = (
+        [part.unit.lane[1] for part in parts if isinstance(part.unit, Bad)]
+        for parts in (known.cause.parts, known.cause.averting)
+    )
+    assert len(first) == 1
+    assert sorted(second) == [UPLINK, DOWNLINK]
+    assert "Without it, other units suffice. It is averted without one outage of " in str(known)
+    assert not known.cause.parts[0].is_needed
+
+
+def test_a_standby_server_is_a_remedy_when_the_server_was_killed() -> None:
+    known = up_to("other seeds", made()["killed"])
+    assert known.remedies
+    as_flown, *tried = known.remedies
+    assert [each.name for each in tried if each.averts] == ["a standby server"]
+    assert tried[0].packets_per_s > as_flown.packets_per_s
+    assert "Why: death of the server.\n  death of the server  at 15.0 s  without: does not" in str(
+        known
+    )
+
+
+def test_keys_of_another_scenario_are_no_cause() -> None:
+    """Of a reference, of the network and of what is known of neither."""
+    own = skytether.load("target", **{"reference.agility": 0.1, "network.uplink": SHORT})
+    assert overridden(own, "target") == ()
+    assert overridden(own, "nothing of this name") == ()
 
 
 def test_without_the_means_to_deliver_no_cause_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 import skytether
 from skytether.explain import units
-from skytether.explain.cases import Bad, DeliveredStretch, FlightCase, Setting, Stall, Stretch
+from skytether.explain.cases import Bad, FlightCase, Setting, Stall, Stretch, overridden
 from skytether.explain.flying import CaseOutcome, fly
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import impairments
@@ -104,6 +104,23 @@ def test_an_outage_is_found_to_the_millisecond_and_losses_by_chance_packet_by_pa
     assert Setting("wind", here.units[0].keys) == here.units[0]  # type: ignore[union-attr]
 
 
+def test_keys_that_belong_together_are_one_unit() -> None:
+    """A trigger of another scheme cannot be undone without the scheme."""
+    one, other = (
+        skytether.load("demo", **keys)
+        for keys in (
+            {"control.horizon": 60, "link.heartbeat_s": 0.4},
+            {"control.scheme": "predictive", "control.trigger": "state_gap(0.1, 1.0)"},
+        )
+    )
+    for scenario, count in ((one, 2), (other, 1)):
+        keys = overridden(scenario, "demo")
+        here = units.circumstances(FlightCase(scenario, overridden=keys), flown(), 5.0, 9.0)
+        found = [each for each in here.units if isinstance(each, Setting) and each.name != "wind"]
+        assert len(found) == count
+        assert tuple(key for each in found for key in each.keys) == keys
+
+
 def test_only_the_kept_units_lose_packets_in_the_window() -> None:
     here = units.circumstances(case(), flown(), 5.0, 9.0)
     (outage,) = (each for each in here.units if isinstance(each, Bad) and not each.is_packet)
@@ -137,7 +154,7 @@ def test_the_perfect_flight_keeps_wind_and_loses_nothing() -> None:
 def test_each_path_is_changed_by_itself() -> None:
     two = FlightCase(
         reading.load("demo-two-links"),
-        delivered=(DeliveredStretch(Stretch((1, DOWNLINK, 0), 100, 300), 0.1),),
+        delivered=((Stretch((1, DOWNLINK, 0), 100, 300), 0.1),),
     )
     paths = two.flown().network.paths
     assert paths[1].downlink.endswith(" & delivered(0, 0.100, 0.200, 0.100000)")

@@ -19,7 +19,6 @@ from helpers import packaged, refusal
 from skytether.__main__ import main
 from skytether.client.compensator import Compensator
 from skytether.client.reporting import Reporter
-from skytether.explain.hypotheses import broken, hypotheses
 from skytether.server import sessions
 from skytether.server.endpoint import Server
 from skytether.server.missions import trajectory_qp, vehicle_motions, waypoints, yielding
@@ -53,6 +52,7 @@ from skytether.shared.telemetry.summary import least_separation
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import NO_HORIZON, NO_INPUT, Mode, Observation, Trajectory
 from skytether.sim import batch, flight
+from skytether.theorem.hypotheses import broken, hypotheses
 from two_vehicles import (
     DT_S,
     alone,

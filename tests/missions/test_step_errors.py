@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 
 from fuzz.adversary.lives import Lives
 from helpers import packaged
-from skytether.explain.hypotheses import broken, hypotheses
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import impairments
 from skytether.netem.proxy import Proxy
@@ -34,6 +33,7 @@ from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario import reading
 from skytether.shared.scenario.whole import Scenario
 from skytether.sim import flight
+from skytether.theorem.hypotheses import broken, hypotheses
 from two_vehicles import clear_m, drawn, left_m, separation_m
 
 DT_S, DT_NS = 0.05, 50 * MS

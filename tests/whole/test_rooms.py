@@ -84,6 +84,7 @@ ROOMS: dict[str, tuple[str, str]] = {
     "the laboratory's commands": ("lab/commands", "compare"),
     "identification": ("lab/identify", "identify quadrotor"),
     "explanations": ("explain", "explain demo"),
+    "the theorem of missions": ("theorem", "explain swap"),
     "figures": ("figures", "reproduce"),
     "environments": ("gym", ""),
     "the library": ("library", ""),

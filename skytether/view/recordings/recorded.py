@@ -18,19 +18,20 @@ from skytether.shared.base import toml
 from skytether.shared.base.errors import RecordingError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.directions import FLIGHT, Directions
-from skytether.shared.events.flight import Event
+from skytether.shared.events.flight import Event, Failure, RecordIncomplete, VehicleEvent
 from skytether.shared.events.processes import Counted
 from skytether.shared.law.model import Indices
 from skytether.shared.scenario.reading import check
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry import drops, ends, feed
 from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, columns_of
+from skytether.shared.telemetry.record import FlightEvent, Record
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary, summarise
 from skytether.view.frames import Timed
 from skytether.view.recordings.container import Container, reading
 from skytether.view.recordings.recording import BEGUN, FEED, About, Begun
-from skytether.view.rows import check_columns, check_values
+from skytether.view.rows import check_columns, check_values, no_rows
 
 SPAN_NS_MAX = 40 * 86_400 * SECOND_NS
 """Longest time from the first frame of a recording to its last [ns]."""
@@ -83,6 +84,30 @@ class Recorded:
     def begin_ns(self) -> int:
         """Time of the first frame [ns; clock of the processes]."""
         return self.frames[0][2].time_ns if self.frames else 0
+
+    @cached_property
+    def record(self) -> Record:
+        """Record of the flight; its times count from the first frame."""
+        events: list[FlightEvent] = []
+        figures: dict[str, Any] = {}
+        for time_ns, process, frame in self.frames:
+            match frame:
+                case Said():
+                    events.append(FlightEvent(time_ns, process, frame.event))
+                case Figures():
+                    figures[process] = frame.figures
+        parts: dict[str, Any] = no_rows(self.scenario)
+        parts |= {part: rows for part, rows in self.parts.items() if part in parts}
+        parts["netem"] = parts["netem"].copy()
+        parts["netem"]["arrived_ns"] -= self.begin_ns
+        log_events = [each.event for each in events]
+        return Record(
+            **parts,
+            failure=_failure(events),
+            figures=figures,
+            events=tuple(events),
+            incomplete=tuple(event for event in log_events if isinstance(event, RecordIncomplete)),
+        )
 
     def events(self) -> Iterator[tuple[int, str, Event]]:
         """Time [ns], process and event of all events except `Counted`."""
@@ -214,3 +239,14 @@ def _columns(described: str) -> np.dtype[np.void]:
 def _check_begun(scenario: str) -> None:
     """Check the scenario of a process; cached, because many processes may have the same."""
     check(toml.loads(scenario), "the scenario of a process", any_network=True)
+
+
+def _failure(events: list[FlightEvent]) -> Failure | None:
+    """Failure of the first vehicle, by number, whose last event is one; None without any."""
+    last: dict[int, Event] = {
+        each.event.vehicle: each.event
+        for each in events
+        if each.process == "client" and isinstance(each.event, VehicleEvent)
+    }
+    ends = (event for _, event in sorted(last.items()))
+    return next((event for event in ends if isinstance(event, Failure)), None)

@@ -127,6 +127,7 @@ def page(recorded: Recorded, figures: Sequence[tuple[str, str]], explanation: st
         + (outcome.verdict if scenario.is_mission else _verdict(summary)),
         [
             *_why(recorded, outcome, explanation),
+            *_theorem(recorded),
             *_first(outcome),
             course(outcome) if fleet > 1 else timeline(flown),
             Folded(
@@ -207,6 +208,17 @@ def _why(recorded: Recorded, outcome: Outcome, explanation: str) -> list[Part]:
         title = "Why it braked"
         parts.append(Table("why", title, says, "", heading, rows[:HAPPENED_MAX], is_grouped=False))
     return parts
+
+
+def _theorem(recorded: Recorded) -> list[Part]:
+    """What the theorem of separation assumes, if it is a mission of which all is recorded."""
+    if not recorded.scenario.keeps_apart or not {"server", "plan"} <= recorded.parts.keys():
+        return []
+    from skytether.theorem.judgement import HEADING, TITLE, judged
+
+    rows = judged(recorded.record, recorded.scenario).rows
+    says = "Least margin of each condition, and of what is promised; see docs/together-proof.md."
+    return [Table("theorem", TITLE, says, "", HEADING, rows, is_grouped=False)]
 
 
 def course(outcome: Outcome) -> Picture:

@@ -7,24 +7,26 @@ The server sends a vehicle a motion every `motion.SPACING` steps, unless it has 
     way               because no motion towards its goal keeps away from another vehicle, or a zone
 
 The first two follow from the rows of a record. The third does not: the server's figures contain it
-for each decision (`waits`), and are read while the case is flown again.
+for each decision (`waits`), which `questions` reads while the flight is flown again.
 """
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, TypeAlias
 
 import numpy as np
 
-from skytether.explain.hypotheses import Flown, began_ns, flown
-from skytether.explain.server_ticks import are_plans, begin_ns, flows, ticks
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array, Flags, Indices
 from skytether.shared.law.motion import SPACING
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, Record, Rows
+from skytether.shared.telemetry.server_ticks import are_plans, begin_ns, flows, ticks
+from skytether.sim import flight
+from skytether.sim.world import World
+from skytether.theorem.hypotheses import Flown, began_ns, flown
 
 AT_ONCE_S = 1e-3
 """Tolerance of times [s]."""
@@ -33,6 +35,8 @@ OTHER = re.compile(r"vehicle (\d+)( to pass)?|a zone")
 
 Reason: TypeAlias = tuple[float, int, str]
 """Time of flight [s], vehicle, and what it waits for, as the server's text."""
+Question: TypeAlias = tuple[float, Callable[[World], None]]
+"""Action of a flight: time [s], and what is done then; see `flight.fly`."""
 Kind = Literal["to begin", "acknowledgement", "way"]
 
 
@@ -83,6 +87,19 @@ class _Vehicle:
     def begins_s(self) -> float:
         """Time at which the server learns that the vehicle flies its first motion [s]."""
         return float(self.time_s[self.heard_at[np.argmax(self.accepted >= 0)]])
+
+
+def questions(scenario: Scenario, reasons: list[Reason]) -> Iterator[Question]:
+    """Actions that append what the server says vehicles wait for, once for each decision."""
+
+    def ask(world: World) -> None:
+        for vehicle, figures in world.endpoint(flight.SERVER[0]).figures()["by_vehicle"].items():
+            time_s = world.now_ns / SECOND_NS
+            reasons.append((time_s, int(vehicle), figures.get("waits") or ""))
+
+    every_s = SPACING * scenario.control.dt
+    for number in range(int((scenario.link.connect_s + scenario.duration) / every_s)):
+        yield number * every_s, ask
 
 
 def waits(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) -> tuple[Wait, ...]:

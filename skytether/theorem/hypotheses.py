@@ -19,7 +19,6 @@ from itertools import combinations
 import numpy as np
 
 from skytether.client.failsafe import STALL_NS
-from skytether.explain.server_ticks import ticks
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.events.flight import ClockContradicted, Flying, SteppedLate
 from skytether.shared.law.model import Array, Flags, Indices
@@ -28,6 +27,7 @@ from skytether.shared.missions.derived import zones
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record, Rows
+from skytether.shared.telemetry.server_ticks import ticks
 from skytether.shared.telemetry.summary import nearest, track
 
 RESTS_MPS = 1e-3

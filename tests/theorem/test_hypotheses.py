@@ -17,17 +17,18 @@ from hypothesis import strategies as st
 
 from helpers import packaged
 from skytether.__main__ import main
-from skytether.cli import recordings
+from skytether.cli import recordings, replay
 from skytether.client.compensator import Compensator
-from skytether.explain import flying, mission
+from skytether.explain import flying
 from skytether.explain.cases import FlightCase
-from skytether.explain.hypotheses import Hypothesis, broken, flown, hypotheses
-from skytether.explain.waits import Wait
 from skytether.library.flight import Flight
 from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record, trace_hash
 from skytether.sim import flight
+from skytether.theorem.hypotheses import Hypothesis, broken, flown, hypotheses
+from skytether.theorem.waits import Wait
+from skytether.view.recordings import report
 
 WHOLE = {"horizon": 135}
 """Horizon with which every motion is recorded to its end."""
@@ -79,6 +80,15 @@ def test_a_recording_gives_the_same(tmp_path: Path) -> None:
     file = tmp_path / "swap.mcap"
     Flight(EIGHT, eight(), name="swap").save(file)
     assert hypotheses(Flight.load(file).record, EIGHT) == hypotheses(eight(), EIGHT)
+
+
+def test_a_report_and_the_page_of_a_recording_have_the_table(tmp_path: Path) -> None:
+    file = tmp_path / "swap.mcap"
+    Flight(EIGHT, eight(), name="swap").save(file)
+    recorded = recordings.opened(file)
+    for html in (report.page(recorded, []), replay.theorem_html(recorded)):
+        assert "each stays in its tube" in html
+        assert "0.129 m" in html
 
 
 def test_what_is_flown_after_the_recorded_horizon_is_not_checked() -> None:
@@ -199,8 +209,9 @@ def waits(kind: str, vehicles: int, duration: float, **keys: Any) -> list[Wait]:
     reference = {"shape": f"swap({vehicles})"}
     scenario = packaged("swap", duration=duration, reference=reference, **keys)
     outcome = flying.fly(FlightCase(scenario, vehicles))
-    assert mission.text(outcome.hypotheses, outcome.waits)
-    return [each for each in outcome.waits if each.kind == kind]
+    assert outcome.judgement is not None
+    assert str(outcome.judgement)
+    return [each for each in outcome.judgement.waits if each.kind == kind]
 
 
 def test_motions_that_are_lost_are_what_a_vehicle_waits_for() -> None:
@@ -240,8 +251,8 @@ def test_the_explanation_of_a_mission_ends_with_both() -> None:
     assert "  2          each stays in its tube           yes   " in said
     assert "  all for vehicle " in said
     written = msgspec.json.decode(known.to_json())
-    assert len(written["hypotheses"]) == 9
-    assert written["waits"][0]["kind"] in ("to begin", "acknowledgement")
+    assert len(written["judgement"]["hypotheses"]) == 9
+    assert written["judgement"]["waits"][0]["kind"] in ("to begin", "acknowledgement")
 
 
 def test_a_recorded_mission_over_udp_is_judged_without_another_flight(

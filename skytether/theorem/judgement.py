@@ -1,28 +1,50 @@
-"""Text of the explanation of a mission: the theorem's assumptions, and waits of vehicles."""
+"""Judgement of a mission's flight: what the theorem assumes, and who waited for whom."""
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
-from skytether.explain.hypotheses import Hypothesis
-from skytether.explain.waits import Wait
+from skytether.shared.scenario.whole import Scenario
+from skytether.shared.telemetry.record import Record
+from skytether.theorem.hypotheses import Hypothesis, hypotheses
+from skytether.theorem.waits import Reason, Wait, waits
 
 WAITS_SHOWN = 6
 """Largest number of waits of a kind that are listed."""
 SHORT_S = 1.0
 """Length of waits for acknowledgements that are usual if nothing was lost [s]."""
 
+TITLE = "What the theorem of separation assumes"
+HEADING = "condition", "", "held", "margin", "of vehicle", "at step", "checked"
 
-def text(found: Sequence[Hypothesis], waited: Sequence[Wait]) -> str:
-    """Assumptions and waits in plain text; empty without a mission."""
-    return "\n".join([*_hypotheses(found), *_waits(waited)])
+
+@dataclass(frozen=True, slots=True)
+class Judgement:
+    """What a mission's record says of the theorem, and of waits; its text is both."""
+
+    hypotheses: tuple[Hypothesis, ...]
+    waits: tuple[Wait, ...] = ()
+    """The longest first; empty of a flight over UDP."""
+
+    @property
+    def rows(self) -> list[Sequence[str]]:
+        """Table of the hypotheses, as text; see HEADING."""
+        return [_row(each) for each in self.hypotheses]
+
+    def __str__(self) -> str:
+        return "\n".join([*_hypotheses(self.hypotheses), *_waits(self.waits)])
+
+
+def judged(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) -> Judgement:
+    """Judgement of a mission's flight, over UDP without waits; `reasons`: see `waits`."""
+    return Judgement(hypotheses(record, scenario), waits(record, scenario, reasons))
 
 
 def _hypotheses(found: Sequence[Hypothesis]) -> Iterator[str]:
     if not found:
         return
-    yield "What the theorem of separation assumes (docs/together-proof.md), and its least margin:"
-    heading = "condition", "", "held", "margin", "of vehicle", "at step", "checked"
-    rows = [heading, *(_row(each) for each in found)]
+    yield f"{TITLE} (docs/together-proof.md), and its least margin:"
+    rows = [HEADING, *(_row(each) for each in found)]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row in rows:
         yield ("  " + "  ".join(map(str.ljust, row, widths))).rstrip()
