@@ -1,10 +1,9 @@
-"""A policy far from its robot: openpi's client alone, and behind `skytether policy`.
+"""Benchmark of a policy on another machine: openpi's client with and without `skytether policy`.
 
-The robot is a pendulum that moves on while its program waits; the policy swings it up. Over real
-sockets, openpi's own client alone speaks TCP through netem's relay, where a piece that is lost is
-sent again after 200 ms; with `policy join` and `policy serve` there is UDP. In virtual time the
-same two ends run over the same networks, beside a call that waits for all datagrams of its message
-and each way's retransmissions.
+The robot is a pendulum that keeps moving during a call; the policy swings it up. Over real sockets,
+openpi's client alone uses TCP through netem's relay, which repeats a lost piece after 200 ms;
+`policy join` and `policy serve` use UDP through netem. In virtual time, the same two ends are
+compared over the same networks with a blocking call that retransmits lost datagrams.
 """
 
 import asyncio
@@ -40,30 +39,35 @@ from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 
 STEP_S, ROWS, PLAYED = 0.05, 20, 2
-"""Step of the pendulum [s], rows of a chunk, and rows that the program plays of each."""
+"""Control step [s], rows of an action chunk, and rows that the program executes of each answer."""
 DEADLINE_S = 0.1
+"""Deadline of a call [s]."""
 TORQUE_MAX, GRAVITY = 2.0, 10.0
+"""Largest torque [N·m] and gravity [m/s²], as in Gymnasium."""
 SKYTETHER = (sys.executable, "-P", "-m", "skytether")
 UPRIGHT = 0.5
-"""Cost of a step below which the pendulum is upright."""
+"""Cost of a step below which the pendulum counts as upright."""
 RETRY_S = 0.2
-"""Linux's smallest retransmission time-out [s]."""
+"""Retransmission time-out of a lost datagram [s]: Linux's smallest for TCP."""
 System = Literal["openpi alone", "policy"]
 SYSTEMS: tuple[System, ...] = ("openpi alone", "policy")
 
 
 @dataclass(frozen=True)
 class Cell:
+    """Condition of the benchmark."""
+
     name: str
     network: str
-    """Impairments of each direction."""
+    """Network impairments of each direction."""
     thinking_s: float = 0.02
+    """Computation time of the policy [s]."""
     camera: bool = False
-    """Whether an observation has two images of 224²."""
+    """Whether an observation has two images of 224 × 224 pixels."""
 
 
 RATES = {"4 Mbit/s, two cameras, 86 ms": 500_000.0}
-"""Rate of a cell with one [B/s]: a fate has none."""
+"""Rate limit by cell, for `Blocking` [B/s]: `Fates` does not model it."""
 CELLS = (
     Cell("no network", "none"),
     *(
@@ -79,19 +83,20 @@ CELLS = (
 @dataclass(frozen=True)
 class PoliciesCounts:
     virtual: int = 50
-    """Runs of each cell in virtual time."""
+    """Number of runs of each cell in virtual time."""
     real: int = 5
-    """Runs of each cell over real sockets."""
+    """Number of runs of each cell over real sockets."""
     seconds: float = 10.0
+    """Duration of a run [s]."""
     together: int = 2
-    """Number of runs at once."""
+    """Number of parallel runs."""
 
 
 FULL, QUICK = PoliciesCounts(), PoliciesCounts(virtual=2, real=1, seconds=3.0)
 
 
 class Pendulum:
-    """Gymnasium's Pendulum, which moves on by the clock."""
+    """Pendulum of Gymnasium, advanced by the clock."""
 
     def __init__(self, seed: int, now_s: float) -> None:
         rng = np.random.default_rng(seed)
@@ -102,11 +107,11 @@ class Pendulum:
 
     @property
     def next_s(self) -> float:
-        """Time of its next step [s]."""
+        """Time of the next control step [s]."""
         return self._began_s + len(self.costs) * STEP_S
 
     def pass_time(self, now_s: float) -> None:
-        """Step until now, with the present torque."""
+        """Simulate until `now_s` with constant torque."""
         while self.next_s < now_s:
             cost = _folded(self.angle) ** 2 + 0.1 * self.speed**2 + 0.001 * self.torque**2
             self.costs.append(cost)
@@ -114,6 +119,7 @@ class Pendulum:
 
 
 def stepped(angle: float, speed: float, torque: float) -> tuple[float, float]:
+    """Angle [rad] and angular velocity [rad/s] after a control step with a torque [N·m]."""
     speed += (1.5 * GRAVITY * math.sin(angle) + 3.0 * torque) * STEP_S
     speed = min(max(speed, -8.0), 8.0)
     return angle + speed * STEP_S, speed
@@ -124,7 +130,7 @@ def _folded(angle: float) -> float:
 
 
 def swing_up(observation: dict[str, Any]) -> dict[str, Any]:
-    """Torques of the next ROWS steps: energy first, then a linear rule near the top."""
+    """Policy: predicted torques of the next ROWS steps; energy control, linear near the top."""
     angle, speed = (float(each) for each in observation["state"])
     rows = np.zeros((ROWS, 1), np.float32)
     for row in range(ROWS):
@@ -141,7 +147,7 @@ def swing_up(observation: dict[str, Any]) -> dict[str, Any]:
 
 @contextmanager
 def policy_server(thinking_s: float) -> Iterator[int]:
-    """Port of a server with openpi's protocol, in a thread of this process."""
+    """Run a policy server in a thread of this process; its port."""
     ready, ports = threading.Event(), list[int]()
 
     async def handle(connection: ServerConnection) -> None:
@@ -172,7 +178,7 @@ def policy_server(thinking_s: float) -> Iterator[int]:
 
 @contextmanager
 def process(*argv: str) -> Iterator[str]:
-    """A command of Skytether; its address."""
+    """Run a command of Skytether; its listening address."""
     line = [*SKYTETHER, *argv]
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as running:
         assert running.stdout
@@ -189,7 +195,7 @@ def process(*argv: str) -> Iterator[str]:
 
 
 def fly(system: System, cell: Cell, seed: int, seconds: float) -> dict[str, float]:
-    """One run; its figures."""
+    """One run over real sockets; its figures."""
     anywhere = "127.0.0.1:0"
     ways = ("--to-server", cell.network, "--to-client", cell.network, "--seed", str(seed))
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
@@ -216,18 +222,18 @@ def fly(system: System, cell: Cell, seed: int, seconds: float) -> dict[str, floa
 
 
 class World(Protocol):
-    """Clock and policy of a program."""
+    """Clock and policy connection of a robot program."""
 
     def now_s(self) -> float: ...
 
     def sleep_until(self, at_s: float) -> None: ...
 
     def infer(self, observation: dict[str, Any]) -> Any:
-        """Reply of the policy; raises RuntimeError if there is none."""
+        """Reply to an observation; raises RuntimeError if the call is answered with an error."""
 
 
 class Real:
-    """The machine's clock, and openpi's client."""
+    """Real clock and openpi's client."""
 
     def __init__(self, url: str) -> None:
         self._client = WebsocketClientPolicy(url)
@@ -239,7 +245,7 @@ class Real:
 
 
 class Virtual:
-    """Both ends of `policy` in virtual time."""
+    """Robot end and policy end in virtual time."""
 
     def __init__(self, cell: Cell, seed: int) -> None:
         options = RobotOptions(
@@ -269,8 +275,8 @@ class Virtual:
 
 
 class Blocking:
-    """A call over TCP that waits for the whole answer, in virtual time: each message is datagrams,
-    and one that is lost is sent again after RETRY_S.
+    """Blocking call in virtual time: a model of TCP in which each lost datagram of a message is
+    retransmitted after RETRY_S.
     """
 
     def __init__(self, cell: Cell, seed: int) -> None:
@@ -307,7 +313,7 @@ class Blocking:
 
 
 def program(world: World, cell: Cell, seed: int, seconds: float) -> dict[str, float]:
-    """The robot's program and the pendulum; figures of the run."""
+    """Run the robot program with the pendulum; figures of the run."""
     images = {}
     if cell.camera:
         shade = np.add.outer(np.arange(224), np.arange(224)).astype(np.uint8)
@@ -321,7 +327,7 @@ def program(world: World, cell: Cell, seed: int, seconds: float) -> dict[str, fl
         try:
             state = np.array([robot.angle, robot.speed])
             rows = world.infer({"state": state, **images})["actions"]
-        except RuntimeError:  # the robot's own stop
+        except RuntimeError:  # the program stops the robot
             failed += 1
             rows = np.zeros((1, 1))
         waits.append(world.now_s() - asked_s)
@@ -343,12 +349,15 @@ def program(world: World, cell: Cell, seed: int, seconds: float) -> dict[str, fl
 
 
 def fly_virtual(run: tuple[str, Cell, int, float]) -> dict[str, float]:
+    """One run in virtual time; its figures."""
     system, cell, seed, seconds = run
     world: World = Virtual(cell, seed) if system == "policy" else Blocking(cell, seed)
     return program(world, cell, seed, seconds)
 
 
 def measure(counts: PoliciesCounts, cells: Sequence[Cell] = CELLS) -> dict[str, Any]:
+    """All runs, in virtual time and over real sockets."""
+
     def runs(count: int) -> list[tuple[System, Cell, int, float]]:
         seeds = range(1, count + 1)
         return [

@@ -1,6 +1,6 @@
-"""Target for a policy that is far from its robot: each payload as a datagram, a call and a reply.
+"""Fuzz target of `skytether.policy`: each payload is used as datagram, observation and reply.
 
-Whatever comes, each call of the robot's program gets one answer, by its deadline.
+Invariant: whatever the payloads, each call of the robot program gets one answer by its deadline.
 """
 
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from fuzz.target import Target
 from skytether.client.secure import SecureLink
 from skytether.policy import exchange, images, messages, parts, robot, schedule, serving, values
 from skytether.policy.images import Compressor, Unpacker
-from skytether.policy.robot import RobotOptions, Said
+from skytether.policy.robot import FrameType, RobotOptions
 from skytether.policy.virtual import ROBOT, SERVER, Emulated, NoActionError
 from skytether.server.secure import SecureGate
 from skytether.shared.base.chance import stream
@@ -26,9 +26,9 @@ from skytether.sim.sealed import make_keys
 OPTIONS = RobotOptions("delta", 50 * MILLISECOND_NS, begin_ns=SECOND_NS)
 OBSERVATION = {"state": np.zeros(2), "image": np.full((32, 40, 3), 9, np.uint8), "prompt": "go"}
 LIFE = 500
-"""Number of payloads after which both ends are replaced by new ones."""
+"""Number of payloads after which both ends are restarted."""
 NEWEST = 40
-"""Number of newest datagrams that are changed."""
+"""Number of newest datagrams used as seeds."""
 
 
 def rows(_: Any) -> dict[str, Any]:
@@ -36,11 +36,11 @@ def rows(_: Any) -> dict[str, Any]:
 
 
 class RobotAndPolicy(Target):
-    """Both ends, which each receive a payload besides their own messages.
+    """Robot end and policy end, which each receive the payload in addition to their own messages.
 
     Args:
-        sealed: whether they have keys; then each payload is encrypted by the other end, as a faulty
-            peer would.
+        sealed: whether the link is encrypted; then each payload is encrypted with the peer's key,
+            as by a faulty peer.
     """
 
     code = (exchange, images, messages, parts, robot, schedule, serving, values)
@@ -91,8 +91,8 @@ class RobotAndPolicy(Target):
             to_server, to_robot = self._link.seal(payload), served.reply.seal(payload)
         lab.server.receive(Datagram(to_server, ROBOT), now_ns=now_ns)
         lab.robot.receive(Datagram(to_robot, SERVER), now_ns=now_ns)
-        lab.say(Said.MESSAGE.value + payload)
-        lab.policy_says(Said.MESSAGE.value + payload, ("policy", lab.server._connections))
+        lab.say(FrameType.MESSAGE.value + payload)
+        lab.policy_says(FrameType.MESSAGE.value + payload, ("policy", lab.server._connections))
         lab.run(now_ns + 1)
         lab.sleep(0.1)
         self._call()
@@ -101,7 +101,7 @@ class RobotAndPolicy(Target):
         lab.answers.clear()
 
     def seeds(self) -> Sequence[bytes]:
-        """Messages of both ends, observations, replies and odd payloads."""
+        """Datagrams of both ends, observations, replies and malformed payloads."""
         packed = [values.pack(each) for each in (OBSERVATION, rows(None), [3, b"", "error"])]
         spoilt = msgpack.packb({b"__jpeg__": b"\xff\xd8\xff\xe0", b"channels_first": True})
         plain = [] if self._link else self._newest

@@ -1,4 +1,4 @@
-"""A robot and a scripted policy in virtual time."""
+"""Robot program and scripted policy in virtual time."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +18,7 @@ OPTIONS = RobotOptions("absolute", 150 * MS, step_ns=20 * MS)
 
 
 def ramp(observation: Any) -> dict[str, Any]:
-    """Ten rows that go on from the position in the observation by 1 a row."""
+    """Ten rows that start at the observed position and increase by 1 per row."""
     at = float(observation["state"][0])
     return {"actions": at + np.arange(10, dtype=np.float32)[:, None], "time": 3}
 
@@ -48,9 +48,9 @@ class Lab(Emulated):
         self, policy: Callable[[Any], Any] = ramp, options: RobotOptions = OPTIONS, **others: Any
     ) -> None:
         self.asked: list[Any] = []
-        """Observations that the policy has seen."""
+        """Observations that the policy has received."""
         self.wire: list[tuple[Address, bytes]] = []
-        """Datagrams as they left, with their receivers."""
+        """Datagrams sent, with their receivers."""
 
         def asked(observation: Any) -> Any:
             self.asked.append(observation)
@@ -65,16 +65,16 @@ def secured(key: VehicleKey | None = None, **options: Any) -> Lab:
 
 
 class Around:
-    """An end whose process may freeze, with a clock and an address of its own."""
+    """End with its own clock and address, whose process can be frozen."""
 
     def __init__(self, end: Endpoint) -> None:
         self.end = end
         self.until_ns = 0
-        """Time until which nothing is done; datagrams wait in the sockets."""
+        """Time until which the process is frozen [ns]; datagrams wait in the sockets."""
         self.shift_ns = 0
-        """Its clock minus that of the others [ns]."""
+        """Clock offset relative to the other end [ns]."""
         self.seen_as: Callable[[Datagram], Datagram] = lambda datagram: datagram
-        """What it hears a datagram as."""
+        """Changes a received datagram, for example its source address."""
         self.leaves: Callable[[Datagram], bool] = lambda _: True
         self._waiting: list[Datagram] = []
 

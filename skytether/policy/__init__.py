@@ -1,4 +1,4 @@
-"""A policy far from its robot: every call is answered by its deadline, over any network.
+"""A policy on another machine than its robot: each call is answered by its deadline.
 
     skytether policy serve --upstream ws://127.0.0.1:8000 --bind 0.0.0.0:47010 --keys robot.keys
     skytether policy join gpu:47010 --listen 127.0.0.1:8000 --actions absolute --keys robot.keys
@@ -7,19 +7,21 @@
     with skytether.policy.Robot("gpu:47010", actions="absolute", keys="robot.keys") as robot:
         reply = robot.infer(observation)
 
-| module | what is in it |
+| module | content |
 |---|---|
-| `robot`, `serving` | the two ends, `RobotEnd` and `PolicyEnd`, driven by datagrams and time |
-| `schedule`, `players` | rows of actions that a robot holds, and which it plays when |
-| `exchange`, `parts`, `pace` | messages as datagrams with parity, at a rate that the path has |
-| `messages` | the wire |
-| `values`, `images` | observations and actions as bytes |
-| `web` | lines to openpi's client and server |
-| `inside` | both ends in Python |
-| `command` | the two commands |
+| `robot`, `serving` | robot end and policy end, `RobotEnd` and `PolicyEnd`, without input/output |
+| `schedule`, `players` | received action chunks, and the row to execute at each control step |
+| `exchange`, `parts`, `pace` | messages as datagrams with parity, at an estimated send rate |
+| `messages` | datagram format |
+| `values`, `images` | serialization of observations and actions |
+| `web` | websocket connections to the robot program and the policy server |
+| `inside` | Python interface: `serve` and `Robot` |
+| `command` | `skytether policy serve` and `skytether policy join` |
+| `virtual` | both ends over an emulated network, in virtual time |
 
-`gym` plays rows by the same `players`. The package imports `shared`, the client's and the server's
-ends of a link, and, where it opens sockets, `shell`. It needs the extra `policy`.
+`gym` uses the same `players`. The package imports `shared`, `client` and `server` for links with
+and without keys, `netem` in `virtual`, and `shell` where it opens sockets. It needs the extra
+`policy`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -32,7 +34,7 @@ __all__ = ["PolicyError", "Robot", "serve"]
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        # Imported on use: `gym` needs the players alone, and none of the extra `policy`.
+        # Imported on first use: `gym` needs only `players`, without the extra `policy`.
         if name not in __all__:
             raise AttributeError(f"module 'skytether.policy' has no attribute {name!r}")
         from skytether.shared.base import extras

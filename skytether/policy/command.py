@@ -1,4 +1,4 @@
-"""`skytether policy serve` beside the policy, and `skytether policy join` on the robot."""
+"""Commands `skytether policy serve` (policy end) and `skytether policy join` (robot end)."""
 
 import re
 import secrets
@@ -41,38 +41,37 @@ RATES = {"kbit": 125.0, "mbit": 125e3, "gbit": 125e6}
 
 ABOUT = """usage: skytether policy serve|join ...
 
-A policy on another machine than its robot, over any network. `serve` runs
-beside the policy's server, `join` on the robot; openpi's client and server are
-as ever.
+Connect a robot program to a policy server on another machine. `serve` runs
+near the policy server, `join` on the robot. openpi's client and server need no
+change.
 
     skytether policy serve --upstream ws://127.0.0.1:8000 --bind 0.0.0.0:47010
         --keys FILE
     skytether policy join gpu:47010 --listen 127.0.0.1:8000 --actions absolute
         --keys FILE
 
-`skytether policy serve --help` and `skytether policy join --help` have their
+`skytether policy serve --help` and `skytether policy join --help` list their
 options."""
 
 
 @dataclass(frozen=True)
 class EndOptions:
-    """Options of both ends."""
+    """Options of both commands."""
 
     keys: Path | None = None
     """File with the keys, made by `skytether keygen`. Without it the link is plaintext, which is
-    refused beyond this machine."""
+    allowed only on this machine."""
     insecure: bool = False
-    """Accept a plaintext link to another machine: anybody on the network between can move the
+    """Allow a plaintext link to another machine: anybody on the network can then control the
     robot."""
     rate: str | None = None
-    """Largest rate at which this end sends, as in 4mbit; by default what the path has, which is
-    measured."""
+    """Largest send rate, as in 4mbit; by default limited only by the measured queueing delay."""
     log: LogFormat = "text"
-    """Format in which each event is printed: a sentence, or a line of JSON for a program."""
+    """Format of the log: text, one sentence per event; json, one JSON object per event."""
     metrics: str | None = None
     """HTTP address for Prometheus metrics and /healthz, HOST:PORT."""
     json: Path | None = None
-    """File for the counters at the end, as JSON."""
+    """JSON file for the counters, written at the end."""
 
 
 @dataclass(frozen=True)
@@ -80,16 +79,16 @@ class ServeOptions(EndOptions):
     """Options of `skytether policy serve`."""
 
     upstream: Annotated[str, Argument(metavar="URL")] = "ws://127.0.0.1:8000"
-    """Address of the policy's server, which speaks openpi's protocol."""
+    """Address of the policy server, which uses openpi's protocol."""
     api_key: str = ""
-    """Key that the policy's server asks for."""
+    """API key of the policy server."""
     bind: Annotated[tuple[str, ...], Argument(metavar="HOST:PORT", append=True)] = ()
-    """HOST:PORT to listen on for robots, by default 127.0.0.1:47010; may be repeated."""
+    """HOST:PORT to listen on for robots, by default 127.0.0.1:47010. May be repeated."""
     patience: str = "30s"
-    """Longest time that the policy may think; then its connection is opened anew."""
+    """Longest time for a reply of the policy server; then its connection is reopened."""
     give_rows: bool = False
-    """Give the policy the rows that the robot will play, as further keys of each observation:
-    delay_steps, coming and committed."""
+    """Add the robot's remaining rows to each observation, as keys delay_steps, coming and
+    committed."""
 
 
 @dataclass(frozen=True)
@@ -99,50 +98,53 @@ class JoinOptions(EndOptions):
     server: Annotated[str, Argument(positional=True, metavar="HOST:PORT")] = ""
     """HOST:PORT of `skytether policy serve`."""
     actions: Literal["absolute", "delta", ""] = ""
-    """What holds the robot when no action is left: the last one again if actions are absolute,
-    zeros if they are changes. Must be given."""
+    """Type of the actions, which sets the hold action, used when no row remains: the last row for
+    absolute, zeros for delta. Required."""
     listen: str = "127.0.0.1:8000"
-    """HOST:PORT to listen on for the robot's program, which connects with openpi's client."""
+    """HOST:PORT to listen on for the robot program, which connects with openpi's client."""
     deadline: str = "150ms"
-    """Longest time for an answer."""
+    """Longest time from a call to its answer, except for the first call."""
     hold: str = "1s"
-    """Longest time to hold when no action is left; then the program gets an error."""
+    """Longest time for which calls are answered with the hold action; then with an error."""
     begin: str = "60s"
-    """Longest time for the first answer: a policy may compile itself at first."""
+    """Longest time from the first call to its answer; some policies compile at first."""
     step: str | None = None
-    """Time for which the program plays a row of actions, as in 20ms; by default it is measured, as
-    the time from an answer to the next call, divided by --rows."""
+    """Length of a control step, in which the program executes a row, as in 20ms; by default it is
+    measured as the time from an answer to the next call, divided by --rows."""
     rows: Annotated[int, Argument(metavar="N")] = 1
-    """Number of rows that the program plays of each answer: `action_horizon` of openpi's
+    """Number of rows that the program executes of each answer: `action_horizon` of openpi's
     ActionChunkBroker, or 1 without one."""
     plays_on: bool = False
-    """Whether the robot goes on to play rows while its program waits for an answer. Needs --step.
-    """
+    """Whether the robot continues to execute rows during a call. Requires --step."""
     when: str = "always"
-    """Which observations are sent: always, or needed(N): those for which fewer than N rows will be
-    left when the answer comes."""
+    """Observations that are sent: always, each; needed(N), those for which fewer than N rows will
+    remain when their action chunk arrives."""
     merge: Literal["clock", "average", "drtc"] = "clock"
-    """Row that is played where several chunks have one: that of the newest by the clock; or as
-    LeRobot's average, or DRTC's rule, whose steps are counted by rows played."""
+    """Rule for a step with rows in several chunks: clock, the row of the newest chunk; average,
+    LeRobot's weighted average; drtc, DRTC's rule. The last two count steps by executed rows, the
+    first by the clock."""
     actions_key: str = "actions"
     """Key of the actions in the policy's replies."""
     resize: Annotated[int | None, Argument(metavar="PIXELS")] = None
-    """Side to which images are resized, with black bars, as openpi does; 224 for its policies."""
+    """Width and height to which images are resized, padded with black as by openpi; 224 for
+    openpi's policies."""
     quality: int = QUALITY
-    """Quality of JPEG, 1 to 100."""
+    """JPEG quality, 1 to 100."""
     raw: Annotated[tuple[str, ...], Argument(metavar="KEY", append=True)] = ()
-    """Key of an image that is sent as it is, as in observation/image; may be repeated."""
+    """Key of an image that is sent without JPEG compression, as in observation/image. May be
+    repeated."""
     path: Annotated[tuple[str, ...], Argument(metavar="LOCAL=HOST:PORT", append=True)] = ()
-    """Path to the server, in place of HOST:PORT; with several, each datagram takes all of them.
-    LOCAL is an interface or an address of this machine, or empty."""
+    """Path to the server, in place of HOST:PORT; with several, each datagram is sent over all of
+    them. LOCAL is an interface or an address of this machine, or empty."""
     robot: Annotated[int, Argument(name="id")] = 1
-    """Number of this robot (0 to 65535), unique among the robots of a server, and of its key."""
+    """Number of this robot and its key, 0 to 65535, unique at the server."""
     record: Path | None = None
-    """File for a row for each answer: when, what kind, how old, how many rows were left."""
+    """File for a record of each answer: time, kind, waiting time, age of the newest chunk, rows
+    computed by the policy."""
 
 
 def policy(argv: Sequence[str]) -> None:
-    """Connect a robot's program with a policy on another machine."""
+    """Connect a robot program to a policy server on another machine."""
     name = argv[0] if argv else ""
     if name == "serve":
         serve(argv[1:])
@@ -158,10 +160,10 @@ def policy(argv: Sequence[str]) -> None:
 
 
 def serve(argv: Sequence[str]) -> None:
-    """Serve robots from beside a policy, until SIGINT or SIGTERM.
+    """Connect robots to a policy server, until SIGINT or SIGTERM.
 
-    Each robot gets a connection of its own to the policy's server. While the policy thinks, a newer
-    observation of the robot takes the place of one that waits.
+    Each robot gets its own websocket connection to the policy server. While the policy computes,
+    only the newest further observation of the robot is kept.
     """
     options = read(ServeOptions(), argv, "skytether policy serve", serve.__doc__)
     if why := web.check_url(options.upstream):
@@ -184,15 +186,16 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def join(argv: Sequence[str]) -> None:
-    """Answer a robot's program by the deadline, with a policy on another machine.
+    """Answer a robot program by the deadline, with a policy on another machine.
 
-    The program connects with openpi's client to --listen. An answer that does not come by the
-    deadline is what is left of the one before, from the present row on; then the robot is held, for
-    --hold at most; then the program gets an error, so that its own stop acts.
+    The program connects to --listen with openpi's client. If the action chunk of a call has not
+    arrived by the deadline, the answer has the remaining rows of earlier chunks. If no row remains,
+    it is the hold action, for at most --hold; then an error, on which the program must stop the
+    robot.
     """
     options = read(JoinOptions(), argv, "skytether policy join", join.__doc__)
     if options.actions == "":
-        why = "what holds the robot is the last row again for one, and zeros for the other"
+        why = "the hold action is the last row for absolute, zeros for delta"
         raise _wrong("--actions", "nothing", f"absolute or delta: {why}")
     if bool(options.server) == bool(options.path):
         got = "both" if options.path else "neither"
@@ -212,7 +215,7 @@ def join(argv: Sequence[str]) -> None:
     link = inside.link_of(options.keys, options.robot)
     for path in paths:
         command.check_sealed(path.peer, secure=link.secure or options.insecure)
-    # Socket 1 is the line, so the second path has number 2.
+    # Socket 1 is the local connection, so the second path has number 2.
     numbered = {number + (number > 0): path for number, path in enumerate(paths)}
     with ExitStack() as stack:
         recorder = None
@@ -236,7 +239,7 @@ def join(argv: Sequence[str]) -> None:
         def figures() -> dict[str, Any]:
             return end.figures() | {"image_bytes": compress.bytes}
 
-        _drive("policy join", figures, shell, options, "the robot's program", metrics.JOIN)
+        _drive("policy join", figures, shell, options, "the robot program", metrics.JOIN)
 
 
 def _robot_options(options: JoinOptions) -> RobotOptions:
@@ -248,7 +251,9 @@ def _robot_options(options: JoinOptions) -> RobotOptions:
             raise _wrong("--when", options.when, "always or needed(N), as in needed(2)")
         spare = int(found[1])
     if options.plays_on and options.step is None:
-        raise _wrong("--plays-on", "no --step", "one: it cannot be measured then")
+        raise _wrong(
+            "--plays-on", "no --step", "--step: the step cannot be measured with --plays-on"
+        )
     return RobotOptions(
         options.actions,
         _time_ns("--deadline", options.deadline),
@@ -311,13 +316,13 @@ def _drive(
 
 
 def _time_ns(flag: str, text: str) -> int:
-    """Time given to a flag [ns]; without a unit in seconds."""
+    """Parse the time given to a flag [ns]; a number without unit is in seconds."""
     expected = "a time such as 150ms or 1.5s, at most an hour"
     return round(_quantity(flag, text, UNITS_NS, (1, 3600 * SECOND_NS), expected))
 
 
 def _rate(text: str | None) -> float:
-    """Rate given to --rate [B/s]."""
+    """Parse the rate given to --rate [B/s]."""
     if text is None:
         return RATE_MAX
     expected = "a rate such as 4mbit, 100kbit to 1gbit"

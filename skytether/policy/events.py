@@ -1,4 +1,4 @@
-"""Events of both ends of a policy that is far from its robot."""
+"""Log events of the robot end and the policy end."""
 
 from skytether.shared.events.flight import Event
 
@@ -8,7 +8,7 @@ class RobotEvent(Event):
 
 
 class PolicyJoined(RobotEvent):
-    sentence = "robot {robot}: session with the policy server at {peer}"
+    sentence = "robot {robot}: session with `policy serve` at {peer}"
     peer: str
 
 
@@ -18,45 +18,45 @@ class RobotJoined(RobotEvent):
 
 class PolicySilent(RobotEvent):
     sentence = (
-        "robot {robot}: nothing from the policy server for {silence_s:.1f} s; saying hello again"
+        "robot {robot}: no datagram from `policy serve` for {silence_s:.1f} s; sending HELLO again"
     )
     silence_s: float
 
 
 class RobotSilent(RobotEvent):
-    sentence = "robot {robot}: nothing for {silence_s:.0f} s, its session has ended"
+    sentence = "robot {robot}: no datagram for {silence_s:.0f} s; its session has ended"
     silence_s: float
 
 
 class JoinRefused(RobotEvent):
-    sentence = "robot {robot}: the policy server refuses it: {reason}"
+    sentence = "robot {robot}: refused by `policy serve`: {reason}"
     reason: str
 
 
 class ProgramConnected(RobotEvent):
-    sentence = "robot {robot}: its program has connected"
+    sentence = "robot {robot}: program connected"
 
 
 class ProgramGone(RobotEvent):
-    sentence = "robot {robot}: its program has disconnected"
+    sentence = "robot {robot}: program disconnected"
 
 
 class Holding(RobotEvent):
-    sentence = "robot {robot}: no action is left, it holds"
+    sentence = "robot {robot}: no row remains; executing the hold action"
 
 
 class PlaysAgain(RobotEvent):
-    sentence = "robot {robot}: actions again after {after_s:.2f} s"
+    sentence = "robot {robot}: executing rows of the policy again after {after_s:.2f} s"
     after_s: float
 
 
 class ObservationRefused(RobotEvent):
-    sentence = "robot {robot}: an observation is refused: {reason}"
+    sentence = "robot {robot}: observation refused: {reason}"
     reason: str
 
 
 class UpstreamLost(RobotEvent):
-    sentence = "robot {robot}: the policy's connection was lost: {reason}; it is opened again"
+    sentence = "robot {robot}: connection to the policy lost: {reason}; reconnecting"
     reason: str
 
 
@@ -65,10 +65,10 @@ class UpstreamFound(RobotEvent):
 
 
 class ChunkRefused(RobotEvent):
-    sentence = "robot {robot}: a chunk is not played: {reason}"
+    sentence = "robot {robot}: action chunk refused: {reason}"
     reason: str
 
 
 class PolicyFailed(RobotEvent):
-    sentence = "robot {robot}: the policy answered with an error: {reason}"
+    sentence = "robot {robot}: error of the policy: {reason}"
     reason: str

@@ -1,8 +1,8 @@
-"""Exchange of messages between two ends of a session, each message as datagrams with parity.
+"""Exchange of messages between the two ends of a session, each as datagrams with parity.
 
-A message that has begun to leave is sent to its end, however slow the path is; of those that wait
-for it, a newer one replaces an older. Each end reports what has come of each message, so that the
-other learns rate, loss and round trip.
+Once its first part is sent, a message is sent completely, however slow the path is. Of the messages
+of a stream that wait for it, only the newest is kept. Each end reports the received parts of each
+message, from which the sender estimates send rate, packet loss ratio and round-trip time.
 """
 
 from collections import OrderedDict, deque
@@ -10,33 +10,34 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from skytether.policy import parts
-from skytether.policy.messages import STAMPS, PartMessage, Seen, encode
+from skytether.policy.messages import STAMPS, PartMessage, Report, encode
 from skytether.policy.pace import RATE_MAX, Pace
 from skytether.policy.parts import Part, Reassembly
 from skytether.shared.base.units import HEADER_BYTES, MICROSECOND_NS, MILLISECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
 
 QUIET_NS = 300 * MILLISECOND_NS
-"""Time without a further part after which a message is reported as it is: longer than the time
-between two datagrams at the least rate."""
+"""Time without a further part after which an incomplete message is reported [ns]; longer than the
+time between two datagrams at the smallest send rate."""
 REMEMBERED_MAX = 64
-"""Number of newest messages whose reports are understood."""
+"""Number of newest sent messages whose reports are evaluated, and of reports that may wait."""
 PART_HEAD_BYTES = 40
-"""Bytes of a datagram beside its part, seal included [B]."""
+"""Header and encryption of a datagram with a part [B]."""
 
 
 @dataclass(slots=True)
 class _Sent:
-    """Message as far as it was sent."""
+    """Message that has been sent at least in part."""
 
     parts: int = 0
+    """Number of parts sent so far."""
     was_limited: bool = False
-    """Whether a part had to wait."""
+    """Whether the send rate delayed a part."""
 
 
 @dataclass(slots=True)
 class _Coming:
-    """Message as far as it has come."""
+    """Message of which parts have arrived and that is not reported yet."""
 
     number: int
     expected: int
@@ -45,39 +46,40 @@ class _Coming:
     sent_us: int = 0
     bytes: int = 0
     places: set[tuple[int, int]] = field(default_factory=set)
-    """Block and place of each part that has come."""
+    """Block and index of each received part."""
 
 
 class Exchange:
     """One end of a session.
 
     Args:
-        rate_max: bound of the rate at which it sends [B/s].
+        session: session number.
+        rate_max: largest send rate [B/s].
     """
 
     def __init__(self, session: int, rate_max: float = RATE_MAX) -> None:
         self.session = session
         self.pace = Pace(rate_max)
         self._queue: dict[int, deque[Part]] = {}
-        """Parts that wait, by stream."""
+        """Parts to be sent, by stream."""
         self._next: dict[int, tuple[bytes, bool]] = {}
-        """Message of each stream that waits for these, and whether it is urgent."""
+        """Message of each stream to be sent after these parts, and whether it is urgent."""
         self._replies: deque[bytes] = deque(maxlen=REMEMBERED_MAX)
-        """Reports that wait."""
+        """Encoded reports to be sent."""
         self._sent: OrderedDict[tuple[int, int], _Sent] = OrderedDict()
         self._numbers: dict[int, int] = {}
         self._coming: dict[int, _Coming] = {}
         self._whole: dict[int, Reassembly] = {}
         self._delay_us = 0
-        """Newest delay by both ends' clocks [µs]."""
+        """Newest one-way delay plus the unknown clock offset, without wrap-around [µs]."""
         self.sent = self.sent_bytes = self.dropped = self.came = self.repaired = 0
 
     def send(self, stream: int, message: bytes, *, is_urgent: bool = False) -> None:
-        """Send a message, in place of one that waits.
+        """Send a message; replaces a message of the stream that waits.
 
         Args:
-            is_urgent: whether as much parity is sent as message, which then arrives whole if any
-                half of it does.
+            is_urgent: whether at least as many parity parts as data parts are sent, so that any
+                half of the parts restores the message.
         """
         self.dropped += stream in self._next
         self._next[stream] = message, is_urgent
@@ -98,11 +100,11 @@ class Exchange:
             self._sent.popitem(last=False)
 
     def is_sending(self, stream: int) -> bool:
-        """Whether parts of a message wait."""
+        """Whether parts of a message of this stream remain to be sent."""
         return bool(self._queue.get(stream))
 
     def due_ns(self) -> int | None:
-        """Time of the next datagram to be sent [ns]; None if nothing waits."""
+        """Time at which `outbox` must be called next [ns]; None if nothing is pending."""
         due = [each.last_ns + QUIET_NS for each in self._coming.values()]
         if self._replies:
             due.append(0)
@@ -111,7 +113,7 @@ class Exchange:
         return min(due, default=None)
 
     def outbox(self, *, now_ns: int) -> list[bytes]:
-        """Datagrams that are due, without a seal."""
+        """Datagrams to be sent now, not yet encrypted."""
         for stream, coming in list(self._coming.items()):
             if now_ns >= coming.last_ns + QUIET_NS:
                 self._report(stream, now_ns)
@@ -121,7 +123,7 @@ class Exchange:
             waiting = list(filter(self.is_sending, self._queue))
             if not waiting:
                 break
-            stream = max(waiting)  # metadata first
+            stream = max(waiting)  # metadata has the highest number, and is sent first
             part = self._queue[stream].popleft()
             sent_us = now_ns // MICROSECOND_NS % STAMPS
             out.append(encode(PartMessage(self.session, *part[:-1], sent_us, part.data)))
@@ -139,7 +141,7 @@ class Exchange:
         return out
 
     def accept(self, message: PartMessage, *, now_ns: int) -> bytes | None:
-        """Accept a part; the message that it makes whole, if it does.
+        """Accept a part; returns the message if this part completes it.
 
         Raises:
             ProtocolError: see `parts.Reassembly.accept`.
@@ -155,7 +157,7 @@ class Exchange:
             arrived = whole.accept(part)
         except ProtocolError as error:
             is_spare = coming and part.number == coming.number and error.reason is not Drop.FIELD
-            if not is_spare:  # else a copy, or parity of a message that is whole
+            if not is_spare:  # else a duplicate, or a surplus part of a complete message
                 raise
         if coming is None:
             count, _ = parts.block_parts(part.size, part.blocks)
@@ -173,7 +175,7 @@ class Exchange:
     def _count(self, coming: _Coming, message: PartMessage, now_ns: int) -> None:
         place = message.block, message.place
         if place in coming.places:
-            return  # it came over another path before
+            return  # a duplicate over another path
         coming.places.add(place)
         self.came += 1
         coming.bytes += len(message.data) + PART_HEAD_BYTES + HEADER_BYTES
@@ -182,7 +184,7 @@ class Exchange:
     def _report(self, stream: int, now_ns: int) -> None:
         coming = self._coming.pop(stream)
         last_us = coming.last_ns // MICROSECOND_NS
-        seen = Seen(
+        seen = Report(
             self.session,
             stream,
             coming.number,
@@ -195,13 +197,13 @@ class Exchange:
         )
         self._replies.append(encode(seen))
 
-    def learn(self, seen: Seen, *, now_ns: int) -> None:
-        """Learn from the other end's report of a message."""
+    def learn(self, seen: Report, *, now_ns: int) -> None:
+        """Update send rate and loss from the other end's report on a message."""
         sent = self._sent.pop((seen.stream, seen.number), None)
         if sent is None or not sent.parts:
             return
         round_trip_us = (now_ns // MICROSECOND_NS - seen.sent_us - seen.held_us) % STAMPS
-        # Both ends' clocks differ by any time, so the delay is counted on from the one before.
+        # The clock offset is unknown, so the delay is unwrapped relative to the previous one.
         change_us = (seen.delay_us - self._delay_us + STAMPS // 2) % STAMPS - STAMPS // 2
         self._delay_us += change_us
         self.pace.heard(

@@ -1,7 +1,7 @@
-"""Images of an observation, resized and as JPEG on their way, and arrays again at the policy.
+"""Images of observations: resized and JPEG-compressed at the robot end, decoded at the policy end.
 
 An image is an array of uint8 with three axes, of which the first or the last has length 3 and the
-others at least SIDE_MIN. Its key is the path to it, as in `images/wrist` or `observation/image`.
+others SIDE_MIN to SIDE_MAX. Its key is its path in the observation, as in `images/wrist`.
 """
 
 import io
@@ -20,6 +20,7 @@ QUALITY = 90
 
 
 def is_image(value: Any) -> bool:
+    """Whether a value is compressed as an image, see the module."""
     if not isinstance(value, np.ndarray) or value.dtype != np.uint8 or value.ndim != 3:
         return False
     height, width = value.shape[1:] if _is_channels_first(value) else value.shape[:2]
@@ -32,13 +33,13 @@ def _is_channels_first(image: NDArray[np.uint8]) -> bool:
 
 
 class Compressor:
-    """Images of observations as they are sent.
+    """Compression of the images of observations.
 
     Args:
-        side: width and height to which images are resized, with black bars that keep their ratio,
-            as openpi's `resize_with_pad` does [px]; None sends them as large as they are.
-        quality: quality of JPEG, 1 to 100.
-        raw: keys of images that are sent as arrays.
+        side: width and height to which images are resized, padded with black to keep the aspect
+            ratio, as in openpi's `resize_with_pad` [px]; None: images are not resized.
+        quality: JPEG quality, 1 to 100.
+        raw: keys of images that are sent as arrays, without JPEG compression.
     """
 
     def __init__(
@@ -46,10 +47,10 @@ class Compressor:
     ) -> None:
         self._side, self._quality, self._raw = side, quality, frozenset(raw)
         self.bytes: dict[str, int] = {}
-        """Bytes of each image of the newest observation, as it is sent, by its key."""
+        """Compressed size of each image of the newest observation, by key [B]."""
 
     def __call__(self, observation: Any) -> Any:
-        """The observation, with each image in place as `Unpacker` expects it."""
+        """Observation with each image replaced by the map that `Unpacker` decodes."""
         self.bytes = {}
         return _mapped(observation, "", self._sent)
 
@@ -72,17 +73,18 @@ class Compressor:
 
 
 class Unpacker:
-    """Images of one observation as they were."""
+    """Decoder of the images of one observation."""
 
     def __init__(self) -> None:
         self._left = MADE_BYTES_MAX
-        """Bytes that further images may take."""
+        """Remaining memory for further images [B]."""
 
     def __call__(self, table: dict[Any, Any]) -> Any:
-        """Image of a map that `Compressor` made; any other map as it is.
+        """Decode a map of `Compressor` into an image; other maps are returned unchanged.
 
         Raises:
-            ValueRefused: it is no image, or all of the observation's are too large.
+            ValueRefused: the JPEG data are invalid, or the images of the observation together
+                exceed MADE_BYTES_MAX.
         """
         if JPEG not in table:
             return table
@@ -90,16 +92,16 @@ class Unpacker:
             with Image.open(io.BytesIO(table[JPEG]), formats=("JPEG",)) as image:
                 width, height = image.size
                 self._left -= 3 * width * height
-                if self._left < 0:  # checked before memory is taken for it
+                if self._left < 0:  # checked before memory is allocated
                     raise ValueRefused(f"got images of more than {MADE_BYTES_MAX} B")
                 array = np.asarray(image.convert("RGB"))
         except (OSError, TypeError, SyntaxError, Image.DecompressionBombError) as error:
-            raise ValueRefused(f"no image: {error}") from None
+            raise ValueRefused(f"invalid JPEG image: {error}") from None
         return np.ascontiguousarray(array.transpose(2, 0, 1)) if table.get(FIRST) else array
 
 
 def _mapped(value: Any, key: str, change: Callable[[str, Any], Any]) -> Any:
-    """Value with each array in it changed, given the path of keys to it."""
+    """Copy of a nested value in which `change(key, leaf)` replaces each leaf."""
     if isinstance(value, dict):
         inner = f"{key}/" if key else ""
         return {name: _mapped(each, f"{inner}{name}", change) for name, each in value.items()}

@@ -1,4 +1,4 @@
-"""Both ends in Python: a function as a policy, and `Robot.infer` for the robot's program."""
+"""Python interface: `serve` for a function as policy, and `Robot` for the robot program."""
 
 import asyncio
 import queue
@@ -17,7 +17,7 @@ import numpy as np
 from skytether.client.link import ClientLink, PlainLink
 from skytether.policy import values
 from skytether.policy.images import QUALITY, Compressor, Unpacker
-from skytether.policy.robot import LINE, RobotEnd, RobotOptions, Said
+from skytether.policy.robot import LINE, FrameType, RobotEnd, RobotOptions
 from skytether.policy.schedule import Actions
 from skytether.policy.serving import PolicyEnd
 from skytether.server.gate import Gate, PlainGate
@@ -35,11 +35,11 @@ Hear = Callable[[Datagram], None]
 
 
 class PolicyError(RuntimeError):
-    """A call has no action to play: the policy failed, or was silent for longer than `hold`."""
+    """No row remained for longer than `hold`, or no metadata, or the observation was refused."""
 
 
 def link_of(keys: Path | str | None, robot: int) -> ClientLink:
-    """Link of a robot with its key, or without one."""
+    """Robot's link: encrypted with its key, or plaintext if `keys` is None."""
     if keys is None:
         return PlainLink()
     from skytether.client.secure import SecureLink
@@ -48,7 +48,7 @@ def link_of(keys: Path | str | None, robot: int) -> ClientLink:
 
 
 def gate_of(keys: Path | str | None) -> Gate:
-    """Gate for robots with keys, or for all."""
+    """Gate that admits robots with keys, or any robot if `keys` is None."""
     if keys is None:
         return PlainGate()
     from skytether.server.secure import SecureGate
@@ -57,6 +57,7 @@ def gate_of(keys: Path | str | None) -> Gate:
 
 
 def policy_end(gate: Gate, **options: Any) -> PolicyEnd:
+    """Policy end with random numbers of the operating system."""
     return PolicyEnd(
         gate,
         boot_id=secrets.randbits(63),
@@ -76,13 +77,13 @@ def _address(name: str, text: str) -> Address:
 def _check_sealed(name: str, address: Address, *, secure: bool) -> None:
     if not (secure or is_loopback(address)):
         raise ConfigError(
-            f"{name}: got {address[0]} without keys, expected keys=FILE, or insecure=True if "
-            "everybody on the network may move the robot"
+            f"{name}: got {address[0]} without keys, expected keys=FILE, or insecure=True, with "
+            "which anybody on the network can control the robot"
         )
 
 
 class _FunctionLine:
-    """Line to a function that is the policy; it is called in one thread."""
+    """Local connection to a policy that is a function, called in one thread."""
 
     address = None
 
@@ -90,14 +91,14 @@ class _FunctionLine:
         self._infer, self._hear = infer, hear
         self._metadata = values.pack(metadata)
         self._asked: dict[Address, bytes] = {}
-        """Observation of each connection; a closed one has none, however long the function took."""
+        """Pending observation of each open connection."""
         self._order: queue.SimpleQueue[Address] = queue.SimpleQueue()
 
     def send(self, payload: bytes, peer: Address) -> bool:
-        if payload[:1] == Said.OPENED:
-            said = Said.OPENED.value + self._metadata
+        if payload[:1] == FrameType.OPENED:
+            said = FrameType.OPENED.value + self._metadata
             asyncio.get_running_loop().call_soon(self._hear, Datagram(said, peer, LINE))
-        elif payload[:1] == Said.MESSAGE:
+        elif payload[:1] == FrameType.MESSAGE:
             self._asked[peer] = payload[1:]
             self._order.put(peer)
         else:
@@ -119,9 +120,9 @@ class _FunctionLine:
                 reply = self._infer(values.unpack(observation))
                 if isinstance(reply, np.ndarray):
                     reply = {"actions": reply}
-                said = Said.MESSAGE.value + values.pack(reply)
+                said = FrameType.MESSAGE.value + values.pack(reply)
             except Exception:
-                said = Said.ERROR.value + traceback.format_exc().encode()
+                said = FrameType.ERROR.value + traceback.format_exc().encode()
             try:
                 loop.call_soon_threadsafe(self._hear, Datagram(said, peer, LINE))
             except RuntimeError:  # the loop has closed
@@ -141,16 +142,18 @@ def serve(
     """Serve a function as the policy of robots, until Ctrl-C.
 
     Args:
-        infer: from an observation, as the robot's program gave it, to a dict with the array
-            `actions` of shape (rows, ...), or to that array. It is called in one thread.
+        infer: from an observation to a dict with the array `actions`, shape (n, *row), or to that
+            array. It is called in one thread.
         bind: HOST:PORT to listen on for robots.
-        keys: file of `skytether keygen` with the keys of all robots.
-        insecure: whether to listen for other machines without keys.
-        metadata: what a program gets when it connects.
-        gives_rows: whether observations have the keys `delay_steps`, `coming` and `committed`.
+        keys: file of `skytether keygen` with the keys of all robots; None: plaintext.
+        insecure: whether plaintext links to other machines are allowed.
+        metadata: metadata that a robot program gets when it connects.
+        gives_rows: whether the keys `delay_steps`, `coming` and `committed` are added to
+            observations, see `PolicyEnd`.
+        on_event: called with each log event.
 
     Raises:
-        ConfigError: an argument is impossible, or there are no keys.
+        ConfigError: an argument is invalid, or keys are missing.
         AddressError: the address cannot be bound.
     """
     at, gate = _address("bind", bind), gate_of(keys)
@@ -161,7 +164,7 @@ def serve(
 
 
 class _CallLine:
-    """Line to the program's thread."""
+    """Local connection to the thread of the robot program."""
 
     address = None
 
@@ -178,34 +181,35 @@ class _CallLine:
 
 
 class Robot:
-    """A robot's program with its policy far away; a context manager.
+    """Client of a robot program for a policy on another machine; a context manager.
 
         with Robot("gpu.example:47010", actions="absolute", keys="robot.keys") as robot:
             while True:
-                play(robot.infer(observe())["actions"][0])
+                execute(robot.infer(observe())["actions"][0])
 
     Args:
         server: HOST:PORT of `skytether policy serve`, or of `serve`.
-        actions: what to hold means: "absolute", the last row again; "delta", zeros.
-        deadline: longest time for an answer [s].
-        step: time that a row is played [s]; None: measured.
-        rows: number of rows that are played of each answer.
-        hold: longest time to hold when no row is left [s].
-        keys: file with the robot's key.
-        robot: number of the robot.
-        insecure: whether to speak to another machine without keys.
-        resize: side to which images are resized [px]; None: not.
-        quality: quality of JPEG.
-        raw: keys of images that are sent as arrays.
-        on_event: called with each event, in another thread.
+        actions: type of the actions, which sets the hold action: "absolute", the last row;
+            "delta", zeros.
+        deadline: longest time from a call to its answer, except for the first call [s].
+        step: length of a control step [s]; None: measured between the calls.
+        rows: number of rows that the program executes of each answer.
+        hold: longest time for which calls are answered with the hold action [s].
+        keys: file with the robot's key; None: plaintext.
+        robot: number of the robot, unique at the server.
+        insecure: whether a plaintext link to another machine is allowed.
+        resize: width and height to which images are resized [px]; None: images are not resized.
+        quality: JPEG quality, 1 to 100.
+        raw: keys of images that are sent without JPEG compression.
+        on_event: called with each log event, in another thread.
 
     Raises:
-        ConfigError: an argument is impossible, or there are no keys.
+        ConfigError: an argument is invalid, or keys are missing.
         AddressError: the server's name cannot be resolved.
     """
 
     metadata: Any = None
-    """What the policy said when it was connected; None until then."""
+    """Metadata of the policy; None before the first call."""
 
     def __init__(
         self,
@@ -252,7 +256,7 @@ class Robot:
         self._thread = threading.Thread(target=self._drive, args=(began,), daemon=True)
         self._thread.start()
         began.result()
-        self._say(Said.OPENED.value)
+        self._say(FrameType.OPENED.value)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -278,23 +282,23 @@ class Robot:
         return self._line.answers.get(timeout=patience_s)
 
     def infer(self, observation: Any) -> Any:
-        """The policy's reply, from the present row on.
+        """Reply to an observation, from the present row on.
 
-        The first call waits for the policy; each further one is answered by the deadline.
+        The first call waits for the policy's chunk; each further call is answered by the deadline.
 
         Raises:
-            PolicyError: there is nothing to play; the robot's own stop must act.
-            ValueRefused: the observation has something else than numbers, texts and arrays.
+            PolicyError: no action is available; the program must stop the robot.
+            ValueRefused: the observation has a value of an unsupported type, see `values.pack`.
         """
         content = values.pack(observation)
         if self.metadata is None:
             with suppress(queue.Empty):
                 self.metadata = values.unpack(self._answer(self._patience_s)[1:])
         if self.metadata is None:
-            raise PolicyError("no policy server has answered")
-        self._say(Said.MESSAGE.value + content)
+            raise PolicyError("no metadata from the policy server")
+        self._say(FrameType.MESSAGE.value + content)
         answer = self._answer(self._patience_s)
-        if answer[:1] == Said.ERROR:
+        if answer[:1] == FrameType.ERROR:
             raise PolicyError(answer[1:].decode())
         return values.unpack(answer[1:])
 

@@ -1,12 +1,12 @@
-"""The wire: four messages, each one msgpack array in one UDP datagram, sealed or plain.
+"""Datagram format: one msgpack array in each UDP datagram, of four types, encrypted or plaintext.
 
-    HELLO    [1, 1, robot, boot_id, name]                         robot → server, until answered
+    HELLO    [1, 1, robot, boot_id, name]                         to the policy end, until answered
     WELCOME  [1, 2, robot, session, boot_id, server_boot_id, refusal]
     PART     [1, 20, session, stream, number, size, blocks, parity, block, place, sent_us, data]
-    SEEN     [1, 21, session, stream, number, came, bytes, delay_us, spread_us, sent_us, held_us]
+    REPORT   [1, 21, session, stream, number, came, bytes, delay_us, spread_us, sent_us, held_us]
 
-Array, version and type stand as in `shared.wire.protocol`, so that the same channels seal them.
-Times are in microseconds modulo 2^32.
+The first two fields, version and type, are those of `shared.wire.protocol`, so that the same
+channels encrypt the datagrams. Times are in microseconds modulo 2^32.
 """
 
 from typing import Annotated, Any, Literal, NamedTuple
@@ -19,10 +19,11 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, VERSION, Refusal, kind_of
 
 NAME: Literal["policy"] = "policy"
-"""Name in a HELLO: a server of flights does not answer it."""
+"""Name in a HELLO, which servers for vehicles ignore."""
 STAMPS = 2**32
+"""Modulus of timestamps [µs]."""
 OBSERVATION, CHUNK, METADATA = range(3)
-"""Streams: observations to the server; chunks of actions and the policy's metadata to the robot."""
+"""Streams: observations to the policy end; action chunks and metadata to the robot end."""
 STREAMS = (OBSERVATION, CHUNK, METADATA)
 
 U8 = Annotated[int, Meta(ge=0, lt=2**8)]
@@ -35,22 +36,22 @@ Stream = Annotated[int, Meta(ge=0, lt=len(STREAMS))]
 class Hello(NamedTuple):
     robot: U16
     boot_id: U63
-    """Number of the robot's run: a new one begins a new session."""
+    """Random number of the robot end's run; a new run gets a new session."""
     name: Literal["policy"] = NAME
 
 
 class Welcome(NamedTuple):
     robot: U16
     session: U32
-    """Number of the session; 0 for a refusal."""
+    """Session number; 0 if refused."""
     boot_id: U63
-    """Boot id of the HELLO."""
+    """`boot_id` of the HELLO."""
     server_boot_id: U63
     refusal: Annotated[int, Meta(ge=0, lt=len(Refusal))] = Refusal.ACCEPTED
 
 
 class PartMessage(NamedTuple):
-    """See `parts.Part`."""
+    """Part of a message, see `parts.Part`."""
 
     session: U32
     stream: Stream
@@ -61,7 +62,7 @@ class PartMessage(NamedTuple):
     block: U8
     place: U8
     sent_us: U32
-    """Sender's clock when the part was sent [µs]."""
+    """Send time by the sender's clock [µs]."""
     data: Annotated[bytes, Meta(min_length=1, max_length=PART_BYTES_MAX)]
 
     @property
@@ -70,28 +71,30 @@ class PartMessage(NamedTuple):
         return Part(stream, number, size, blocks, parity, block, place, data)
 
 
-class Seen(NamedTuple):
-    """What has come of a message, sent when nothing more is expected of it."""
+class Report(NamedTuple):
+    """Report on a message, sent when all its parts have arrived or no more are expected."""
 
     session: U32
     stream: Stream
     number: U63
     came: U16
-    """Number of its parts that came."""
+    """Number of received parts; 0: a keep-alive, where `number` is 1 if the robot end has the
+    metadata."""
     bytes: U32
-    """Bytes of these parts."""
+    """Bytes of the received parts, headers included [B]."""
     delay_us: U32
-    """Receiver's clock minus `sent_us` of the part that came last, in both ends' clocks [µs]."""
+    """Receive time of the last part by the receiver's clock minus its `sent_us` [µs]: one-way delay
+    plus the unknown clock offset."""
     spread_us: U32
-    """Time from the first part to the last [µs]."""
+    """Time between receiving the first and the last part [µs]."""
     sent_us: U32
-    """`sent_us` of the part that came last [µs]."""
+    """`sent_us` of the last received part [µs]."""
     held_us: U32
-    """Time from that part until this message [µs]."""
+    """Time between receiving that part and sending this report [µs]."""
 
 
-Message = Hello | Welcome | PartMessage | Seen
-KINDS: dict[int, type[Any]] = {1: Hello, 2: Welcome, 20: PartMessage, 21: Seen}
+Message = Hello | Welcome | PartMessage | Report
+KINDS: dict[int, type[Any]] = {1: Hello, 2: Welcome, 20: PartMessage, 21: Report}
 _NUMBERS = {kind: number for number, kind in KINDS.items()}
 _DECODERS = {number: msgspec.msgpack.Decoder(kind) for number, kind in KINDS.items()}
 _ENCODER = msgspec.msgpack.Encoder()
@@ -102,10 +105,10 @@ def encode(message: Message) -> bytes:
 
 
 def decode(payload: bytes) -> Message:
-    """Message of a datagram.
+    """Decode a datagram.
 
     Raises:
-        ProtocolError: the datagram is no message.
+        ProtocolError: the datagram is invalid.
     """
     if len(payload) > PAYLOAD_BYTES_MAX:
         raise ProtocolError(Drop.TOO_LONG)
@@ -118,7 +121,7 @@ def decode(payload: bytes) -> Message:
         raise ProtocolError(Drop.TYPE)
     count = payload[0] & 0x0F
     try:
-        # The rest as an array of its own: a header of one byte, then the fields.
+        # Decode the fields after version and type as an array, with a new one-byte header.
         message: Message = _DECODERS[kind].decode(bytes((0x90 | max(count - 2, 0),)) + payload[3:])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         raise ProtocolError(Drop.FIELD) from None

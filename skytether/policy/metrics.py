@@ -1,66 +1,66 @@
-"""Metrics of both ends of a policy, see `shell.processes.metrics`."""
+"""Metrics of the robot end and the policy end, see `shell.processes.metrics`."""
 
 from skytether.shell.processes.metrics import Metric, table
 
 
 def _link(group: str) -> tuple[Metric, ...]:
-    """Metrics of an exchange whose figures are in a group."""
+    """Metrics of the `Exchange` whose figures are in this group."""
     return tuple(each._replace(figure=f"{group}/{each.figure}") for each in _LINK)
 
 
 _LINK = table("""
 sent policy_sent_parts_total
-    Datagrams with parts of messages that were sent.
+    Sent datagrams with parts of messages.
 sent_bytes policy_sent_bytes_total
-    Bytes of these, with UDP's and IP's headers.
+    Bytes of these datagrams, with UDP and IP headers.
 replaced policy_replaced_messages_total
-    Messages that were not sent, because a newer one took their place.
+    Messages that were not sent, because a newer message replaced them.
 came policy_received_parts_total
-    Datagrams with parts of messages that came, copies left out.
+    Received datagrams with parts of messages, without duplicates.
 repaired policy_repaired_parts_total
-    Parts that were lost, and made from parity.
+    Lost data parts that were restored from parity.
 given_up policy_given_up_messages_total
-    Messages of which parts came, and that a newer one has replaced.
+    Received messages discarded incomplete, because newer ones arrived.
 loss policy_loss_ratio
-    Share of the datagrams sent that are lost.
+    Packet loss ratio of the datagrams sent.
 rate_bytes_per_s policy_rate_bytes_per_second
-    Rate at which datagrams may leave.
+    Send rate.
 queue_s policy_queue_seconds
-    Time that the newest message waited in queues of the network.
+    Queueing delay of the newest message in the network.
 round_trip_s policy_round_trip_seconds
-    Round trip of the newest message, without its time at the other end.
+    Round-trip time of the newest message, without processing at the other end.
 """)
 JOIN = table("""
 calls policy_calls_total
-    Calls of the robot's program.
+    Calls of the robot program.
 answers/{kind} policy_answers_total
-    Answers to it: the call's own chunk, the rest of earlier ones, hold, or an error.
+    Answers by kind: chunk of this call, remaining rows, hold action, or error.
 late_s_max policy_late_answer_seconds_max
-    Longest time by which an answer came after its deadline.
+    Longest time from a deadline to its answer.
 observations_refused policy_refused_observations_total
-    Observations that were too large, or no values.
+    Observations that were too large or invalid.
 delay_s policy_delay_seconds
-    Longest time from an observation to its chunk, of the newest 64.
+    Longest time from an observation to its action chunk, of the newest 64 chunks.
 step_s policy_step_seconds
-    Time for which the program plays a row.
+    Length of a control step.
 chunk_age_s policy_chunk_age_seconds
-    Age of the observation that the newest answer was made from.
+    Age of the newest chunk's observation at the newest answer.
 rows_left policy_rows_left
-    Rows of the newest answer that the policy has made.
+    Rows of the newest answer computed by the policy.
 image_bytes/{key} policy_image_bytes
-    Bytes of each image of the newest observation, as it is sent.
+    Compressed size of each image of the newest observation.
 dropped/{reason} policy_dropped_datagrams_total
     Datagrams that were dropped, by reason.
 """) + _link("link")
 SERVE = table("""
 robots policy_robots
-    Robots in session.
+    Robots with a session.
 observations policy_observations_total
-    Observations that have come.
+    Observations received.
 observations_replaced policy_replaced_observations_total
-    Observations that a newer one replaced while the policy was thinking.
+    Observations that a newer one replaced while the policy was computing.
 answers policy_chunks_total
-    Answers of the policy.
+    Replies of the policy.
 errors policy_errors_total
     Errors of the policy.
 dropped/{reason} policy_dropped_datagrams_total

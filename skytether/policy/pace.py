@@ -1,9 +1,10 @@
-"""Rate and loss of one direction, from what the receiver reports.
+"""Send rate and packet loss ratio of one direction, estimated from the receiver's reports.
 
-The rate follows the delay: while packets queue up (their delay exceeds the least of the last
-seconds by more than QUEUE_HIGH_NS) it falls below what arrived, and while the queue is short and
-the rate was used, it rises. Loss alone does not lower it: on radio links it is no sign of a queue.
-See LEDBAT (RFC 6817) and Google's congestion control (RFC 8698 has a kindred one) for the idea.
+Delay-based congestion control: the queueing delay is the one-way delay minus its minimum over the
+last LEAST_NS. Above QUEUE_HIGH_NS the send rate is reduced below the received rate. Below
+QUEUE_LOW_NS it is raised if it limited the sender. Loss alone does not reduce it, because on radio
+links loss does not imply a queue. Compare LEDBAT (RFC 6817), NADA (RFC 8698) and Google's
+congestion control.
 """
 
 from collections import deque
@@ -11,50 +12,55 @@ from collections import deque
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 RATE_FIRST, RATE_MIN = 1_250_000.0, 12_500.0
-"""Rate before the first report, and the least [B/s]."""
+"""Send rate before the first report, and smallest send rate [B/s]."""
 RATE_MAX = 125_000_000.0
+"""Largest send rate [B/s]."""
 BURST_BYTES = 3600
-"""Bytes that may leave at once."""
+"""Largest burst: bytes that may be sent back to back [B]."""
 QUEUE_HIGH_NS, QUEUE_LOW_NS = 40 * MILLISECOND_NS, 15 * MILLISECOND_NS
+"""Queueing delays above which the send rate is reduced, and below which it is raised [ns]."""
 LOWERED_EVERY_NS = 200 * MILLISECOND_NS
+"""Shortest time between two reductions [ns]."""
 LOWER, RISE = 0.85, 1.08
+"""Factors of the send rate at a reduction and at a raise."""
 LEAST_NS = 10 * SECOND_NS
-"""Time for which the least delay is remembered: clocks drift apart by less than 1 ms in it."""
+"""Window of the smallest delay [ns], in which clocks drift apart by less than 1 ms."""
 PARTS_MIN = 6
-"""Number of parts from which on the rate at which they came is taken as that of the path."""
+"""Smallest number of received parts whose rate counts as the rate of the path."""
 LOSS_FIRST, LOSS_MAX = 0.02, 0.4
+"""Packet loss ratio assumed before the first report, and largest estimate."""
 GAIN_UP, GAIN_DOWN = 0.3, 0.05
-"""Weight of a report that says more, or less, than the estimate of the loss."""
+"""Filter gains for a reported loss above and below the estimate."""
 
 
 class Pace:
-    """Pace of one direction.
+    """Send rate and loss estimate of one direction.
 
     Args:
-        most: bound of the rate [B/s].
+        most: largest send rate [B/s].
     """
 
     def __init__(self, most: float = RATE_MAX) -> None:
         self._most = most
         self.rate = min(RATE_FIRST, most)
-        """Bytes that may be sent in a second [B/s]."""
+        """Send rate [B/s]."""
         self.loss = LOSS_FIRST
-        """Share of the parts that are lost."""
+        """Estimated packet loss ratio, 0 to LOSS_MAX."""
         self.round_trip_ns: int | None = None
-        """Newest round trip, without the time at the other end [ns]."""
+        """Newest round-trip time, without the processing time of the other end [ns]."""
         self.queue_ns = 0
-        """Newest delay minus the least [ns]."""
+        """Newest queueing delay [ns]."""
         self._least: deque[tuple[int, int]] = deque()
-        """Times and delays [ns] of which each is the least since; the first is the least of all."""
+        """Times and delays [ns] of a moving minimum; delays increase, the first is the minimum."""
         self._lowered_ns = -LOWERED_EVERY_NS
         self._free_ns = 0
 
     def due_ns(self) -> int:
-        """Time at which the next datagram may leave [ns]."""
+        """Time from which the next datagram may be sent [ns]."""
         return self._free_ns - int(BURST_BYTES / self.rate * SECOND_NS)
 
     def sent(self, size: int, now_ns: int) -> None:
-        """Note that a datagram has left, of this size [B]."""
+        """Count a datagram of this size [B] as sent."""
         self._free_ns = max(self._free_ns, now_ns) + int(size / self.rate * SECOND_NS)
 
     def heard(
@@ -69,22 +75,23 @@ class Pace:
         was_limited: bool,
         now_ns: int,
     ) -> None:
-        """Learn from a report.
+        """Update the send rate and the loss from a report on a message.
 
         Args:
-            sent, came: number of parts of a message that were sent, and that came.
-            size: bytes of those that came.
-            delay_ns: delay of the last, up to a constant [ns].
-            round_trip_ns: round trip of the last, which is no shorter than any queue on it [ns].
-            spread_ns: time from the first to the last at the receiver [ns].
-            was_limited: whether the message took as long as the rate allows.
+            sent, came: number of parts sent, and of parts received.
+            size: bytes of the received parts [B].
+            delay_ns: one-way delay of the last part, plus an unknown constant clock offset [ns].
+            round_trip_ns: round-trip time of the last part, an upper bound of the queueing delay
+                [ns].
+            spread_ns: time between receiving the first and the last part [ns].
+            was_limited: whether the send rate delayed the message.
         """
         self.round_trip_ns = round_trip_ns
         share = max(0.0, 1.0 - came / sent)
         self.loss += (GAIN_UP if share > self.loss else GAIN_DOWN) * (share - self.loss)
         self.loss = min(self.loss, LOSS_MAX)
         if self._least and delay_ns - self._least[0][1] > round_trip_ns:
-            self._least.clear()  # no queue is that long: a clock has jumped
+            self._least.clear()  # longer than the round-trip time: a clock was stepped
         while self._least and self._least[-1][1] >= delay_ns:
             self._least.pop()
         self._least.append((now_ns, delay_ns))

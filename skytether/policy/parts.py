@@ -1,12 +1,13 @@
-"""A message as datagrams with parity, and back: any k of its k + m parts are enough.
+"""Split messages into datagrams with parity, and reassemble them.
 
-A message is cut into blocks of at most BLOCK_PARTS parts of equal length, and m parts of parity
-are added to each block (a Reed-Solomon code, by zfec). Parts of all blocks take turns, so that a
-burst of losses falls on several. With 18 parts and a loss of 5 %, a message arrives whole in 40 %
-without parity, and in 99.6 % with 4 parts of it.
+A message is split into blocks of k <= BLOCK_PARTS data parts of equal length, and m parity parts
+are added to each block (Reed-Solomon code of zfec): any k of the k + m parts restore the block.
+Parts of the blocks are sent interleaved, so that a burst of losses is spread over the blocks. With
+18 data parts and a packet loss ratio of 5 %, 40 % of the messages arrive complete without parity,
+and 99.6 % with 4 parity parts.
 
-Nothing is sent again. A receiver holds the newest HELD_MAX messages that are not whole yet; when
-one is whole, those before it are given up, because a newer one replaces them.
+Parts are not retransmitted. The receiver keeps the newest HELD_MAX incomplete messages. When a
+message is complete, it discards the older ones, which the newer message replaces.
 """
 
 from collections.abc import Callable
@@ -19,45 +20,47 @@ from skytether.policy.values import BYTES_MAX
 from skytether.shared.wire.drop import Drop, ProtocolError
 
 PART_BYTES_MAX = 1120
-"""Largest number of bytes of a message in one datagram, which stays below 1200 B with its header
-and the seal of a channel [B]."""
+"""Largest part [B]; with headers and encryption the datagram stays below 1200 B."""
 BLOCK_PARTS = 192
+"""Largest number of data parts of a block."""
 PARITY_MAX = 64
-"""Largest number of parts of parity of a block: with BLOCK_PARTS the 256 of the code."""
+"""Largest number of parity parts of a block; the code has at most 256 parts."""
 HELD_MAX = 4
+"""Largest number of incomplete messages that a receiver keeps of a stream."""
 WHOLE_MIN = 0.995
-"""Share of messages that are to arrive whole at the loss that is measured."""
+"""Required share of complete messages at the measured loss."""
 
 
 Form = tuple[int, int, int]
-"""Size of a message, its blocks and their parity."""
+"""Size of a message [B], number of blocks, and number of parity parts of each block."""
 
 
 class Part(NamedTuple):
     """One datagram of a message."""
 
     stream: int
-    """Number of the row of messages in which a newer one replaces an older."""
+    """Number of the stream; its newer messages replace its older ones."""
     number: int
-    """Number of the message, rising by one."""
+    """Sequence number of the message in its stream."""
     size: int
-    """Bytes of the whole message."""
+    """Size of the message [B]."""
     blocks: int
     parity: int
-    """Parts of parity of each block."""
+    """Number of parity parts of each block."""
     block: int
     place: int
-    """Number of the part in its block; parity follows the message."""
+    """Index of the part in its block; data parts come before parity parts."""
     data: bytes
 
 
 def block_parts(size: int, blocks: int) -> tuple[int, int]:
-    """Number k of parts of a block without parity, and their length [B]."""
+    """Number k of data parts of a block, and the length of each part [B]."""
     count = max(1, -(-size // (blocks * PART_BYTES_MAX)))
     return count, max(1, -(-size // (blocks * count)))
 
 
 def blocks_of(size: int) -> int:
+    """Number of blocks of a message of this size [B]."""
     return max(1, -(-size // (PART_BYTES_MAX * BLOCK_PARTS)))
 
 
@@ -65,7 +68,7 @@ def split(message: bytes, stream: int, number: int, parity: Callable[[int], int]
     """Parts of a message, in the order in which they are sent.
 
     Args:
-        parity: number of parts of parity for a block of so many parts.
+        parity: from the number of data parts of a block to its number of parity parts.
     """
     size, blocks = len(message), blocks_of(len(message))
     count, length = block_parts(size, blocks)
@@ -85,30 +88,30 @@ def split(message: bytes, stream: int, number: int, parity: Callable[[int], int]
 
 
 class Whole(NamedTuple):
-    """A message that is whole."""
+    """Complete message."""
 
     message: bytes
     repaired: int
-    """Number of its parts that were lost, and made from parity."""
+    """Number of lost data parts that were restored from parity."""
 
 
 class Reassembly:
-    """Messages of one stream from their parts."""
+    """Reassembly of the messages of one stream."""
 
     def __init__(self) -> None:
         self._partial: dict[int, tuple[Form, list[dict[int, bytes]]]] = {}
-        """Messages that are not whole, by number: their parts, by block and place."""
+        """Incomplete messages by sequence number: the parts of each block by index."""
         self.newest = -1
-        """Number of the newest message that was whole."""
+        """Sequence number of the newest complete message; -1: none."""
         self.given_up = 0
-        """Number of messages of which parts came, and that a newer one has replaced."""
+        """Number of messages discarded incomplete, because newer ones arrived."""
 
     def accept(self, part: Part) -> Whole | None:
-        """Accept a part; the message that it makes whole, if it does.
+        """Accept a part; returns the message if this part completes it.
 
         Raises:
-            ProtocolError: the part cannot be one of a message, is a copy, or a newer message is
-                whole already.
+            ProtocolError: the part's fields are invalid or differ from those of the message's other
+                parts, it is a duplicate, or a newer message is already complete.
         """
         _check(part)
         if part.number <= self.newest:
@@ -147,7 +150,7 @@ class Reassembly:
 def _joined(block: dict[int, bytes], count: int, parity: int) -> bytes:
     if all(index < count for index in block):
         return b"".join(block[index] for index in range(count))
-    # The decoder wants a part of the message that has come at its own place.
+    # The decoder requires each received data part at its own index.
     spare = iter([index for index in block if index >= count])
     order = [index if index in block else next(spare) for index in range(count)]
     return b"".join(zfec.Decoder(count, count + parity).decode([block[i] for i in order], order))
@@ -164,8 +167,11 @@ def _check(part: Part) -> None:
 
 
 def parity_for(count: int, loss: float) -> int:
-    """Least number of parts of parity with which a block arrives whole in WHOLE_MIN of all cases,
-    if each part is lost with the same probability.
+    """Number of parity parts with which a block is restored with probability WHOLE_MIN.
+
+    Args:
+        count: number of data parts.
+        loss: packet loss ratio; losses are assumed independent.
     """
     for extra in range(PARITY_MAX):
         sent = count + extra

@@ -1,10 +1,11 @@
-"""Players: rules at the robot's end of the link that choose the action of each step.
+"""Players: rules at the robot end that choose the row (action) to execute at each control step.
 
-An agent sends chunks: rows of actions for coming steps. Packets are late, lost and overtaken, so
-the robot needs a rule for the row of the present step. `Clocked` is Skytether's. `Newest`, `Queue`
-and `Freshest`, for comparison, are common rules of other projects, from public descriptions.
+A policy sends action chunks: rows for successive steps. Chunks arrive late, out of order or not at
+all, so the robot needs a rule that chooses the row of the present step. `Clocked` is Skytether's.
+`Newest`, `Queue` and `Freshest` are rules of other projects, for comparison, implemented from
+public descriptions.
 
-A player stores only tuples, so that a shallow copy is a snapshot of what the robot holds.
+A player stores only tuples, so that a shallow copy is a snapshot of its state.
 """
 
 from abc import ABC, abstractmethod
@@ -15,42 +16,45 @@ from numpy.typing import NDArray
 from skytether.shared.base.errors import ConfigError
 
 Row = NDArray[Any]
-"""Action of one step; a record for a Dict or Tuple space, see `gym.spaces`."""
+"""Action of one control step; a structured array for a Dict or Tuple space, see `gym.spaces`."""
 
 HELD_MAX = 16
-"""Largest number of chunks that a player holds; the oldest are dropped."""
+"""Largest number of chunks that a player stores; the oldest are discarded."""
 ROWS_HELD_MAX = 4096
-"""Largest number of rows that `Freshest` holds; the last are dropped."""
+"""Largest number of rows that `Freshest` stores; the rows of the latest steps are discarded."""
 NEWER_WEIGHT = 0.7
-"""Weight of the newer row in an average: LeRobot's default."""
+"""Weight of the newer row in an average; the default of LeRobot."""
 
 
 class Chunk(NamedTuple):
-    """Answer of an agent."""
+    """Action chunk of a policy."""
 
     rows: NDArray[Any]
-    """Actions of successive steps; shape (n, *row). With n = 0 nothing is sent."""
+    """Actions of successive steps; shape (n, *row). With n = 0 no chunk is sent."""
     first: int | None = None
-    """Step of the first row, as the player counts steps; None: the newest observation's step."""
+    """Step of the first row, as the player counts steps; None: step of the newest observation."""
     thought_ns: int | None = None
-    """Thinking time of the answer [ns], to replay a run; None: from the wrapper's `thinking`."""
+    """Computation time of the chunk [ns], to repeat a run; None: `thinking` of the environment."""
 
 
 class Held(NamedTuple):
-    """Chunk that has arrived."""
+    """Received chunk."""
 
     generation: int
-    """Number of the chunk, rising in the order of sending."""
+    """Number of the chunk, increasing in the order of sending."""
     first: int
+    """Step of the first row, as the player counts steps."""
     rows: NDArray[Any]
 
 
 class Player(ABC):
+    """Rule that chooses the row to execute at each control step."""
+
     def __init__(self) -> None:
         self.held: tuple[Held, ...] = ()
-        """Chunks with rows that may still be played, the newest generation first."""
+        """Chunks with rows that may still be executed."""
         self.last: Row | None = None
-        """Row to repeat when rows have run out; None before the first."""
+        """Row to repeat when no row remains; None before the first row."""
 
     def __copy__(self) -> "Player":
         # Called three times per step; the default `copy` takes ten times as long.
@@ -59,20 +63,20 @@ class Player(ABC):
         return made
 
     def number(self, step: int) -> int:
-        """Number that the robot gives to a step when it reports an observation."""
+        """Number of a step as the player counts steps; sent with an observation."""
         return step
 
     @abstractmethod
     def accept(self, chunk: Held, step: int) -> None:
-        """Accept a chunk that arrives before the row of `step` is played."""
+        """Accept a chunk that arrives before the row of `step` is executed."""
 
     @abstractmethod
     def row(self, step: int) -> Row | None:
-        """Row to play at a step, called once for each step; None if rows have run out."""
+        """Row to execute at a step, called once per step; None if no row remains."""
 
 
 class Clocked(Player):
-    """Player that plays the present step's row, from the newest chunk that has this row."""
+    """Player that executes the row of the present step of the newest chunk that has one."""
 
     def accept(self, chunk: Held, step: int) -> None:
         if any(each.generation == chunk.generation for each in self.held):
@@ -110,17 +114,18 @@ class Newest(Player):
 
 
 class Queue(Player):
-    """Player that plays a queue of rows in order, as in LeRobot's asynchronous inference.
+    """Player that executes a queue of rows in order, as in LeRobot's asynchronous inference.
 
-    Steps are counted by rows played, not by the clock: the count stops while the queue is empty.
-    When a chunk arrives, its rows up to the count are skipped, and the others replace the queue; if
-    both have a row for a step, the newer one is played, or an average.
+    Steps are counted by executed rows, not by the clock: the count stops while the queue is empty.
+    When a chunk arrives, its rows for steps already executed are skipped, and the others replace
+    the queue. If both have a row for a step, the newer row is executed, or a weighted average.
 
     Args:
         merge: rule for steps with an older and a newer row.
 
     Raises:
-        ConfigError: rows are to be averaged, but are not real numbers, as in a Discrete space.
+        ConfigError: `accept` cannot average rows of other types than floating-point numbers, for
+            example of a Discrete space.
     """
 
     def __init__(self, merge: Literal["replace", "average"] = "replace") -> None:
@@ -135,7 +140,7 @@ class Queue(Player):
         rows = chunk.rows[max(0, self.played - chunk.first) :]
         first = max(chunk.first, self.played)
         if self.merge == "average" and rows.dtype.kind != "f":
-            expected = "real numbers: those of a Box, or merge='replace'"
+            expected = "floating-point numbers, as of a Box space, or merge='replace'"
             raise ConfigError(f"player: got rows of {rows.dtype} to average, expected {expected}")
         if self.merge == "average" and self.held:
             queued = self.held[0]
@@ -159,11 +164,11 @@ class Queue(Player):
 
 
 class Freshest(Player):
-    """Player that plays the newest row of each step, as in DRTC (distributed real-time chunking).
+    """Player that executes the newest row of each step, as distributed real-time chunking (DRTC).
 
-    Steps are counted by rows played, as in `Queue`. A chunk older than the newest so far is
-    ignored. Rows of a newer chunk replace rows of the same steps, except steps that were played;
-    rows of other steps stay.
+    Steps are counted by executed rows, as in `Queue`. A chunk older than the newest received one is
+    ignored. Rows of a newer chunk replace rows of the same steps, except steps already executed;
+    rows of other steps are kept.
     """
 
     def __init__(self) -> None:

@@ -1,13 +1,17 @@
-"""The robot's end: answers each call of its program by the deadline, whatever the network does.
+"""Robot end: answers each call of the robot program by the deadline, whatever the network does.
 
-The program speaks through the line (socket 1): openpi's websocket protocol, or `Robot.infer`. A
-call is an observation. It is answered as soon as its own chunk has come; at the deadline with the
-newest chunk that has rows for now, cut to now; then with what holds the robot, for at most
-`hold_ns`; then with an error, so that the robot's own stop acts. While chunks take longer than the
-deadline, waiting gains nothing: a call is answered at once if rows are left. The first call of a
-program is answered when the first chunk has come, within `begin_ns`: the robot has not moved yet.
+The program is connected through the local connection (socket 1): a websocket with openpi's
+protocol, or `Robot.infer`. A call is an observation. It is answered
 
-What the line hears and sends begins with one of `Said`.
+- with its own action chunk, as soon as that arrives;
+- at the deadline, with the remaining rows of earlier chunks from the present step on, or at once if
+  the newest chunks took longer than the deadline;
+- if no row remains, with the hold action for at most `hold_ns`, then with an error, after which the
+  program must stop the robot.
+
+The first call of a program waits for its chunk for up to `begin_ns`, since the robot has not moved.
+
+A frame of the local connection begins with a byte of `FrameType`.
 """
 
 from collections import Counter, deque
@@ -26,7 +30,7 @@ from skytether.policy.messages import (
     METADATA,
     OBSERVATION,
     Hello,
-    Seen,
+    Report,
     Welcome,
     decode,
     encode,
@@ -43,22 +47,22 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Refusal
 
 LINE = 1
-"""Socket of the line."""
+"""Socket number of the local connection to the robot program or the policy."""
 SILENCE_NS = 3 * SECOND_NS
-"""Time without a packet after which the robot says HELLO again."""
+"""Time without a datagram after which the robot end sends HELLO again [ns]."""
 ALIVE_NS = SECOND_NS
-"""Time after which something is sent, so that the server knows that the robot is there."""
+"""Time without a datagram sent after which a keep-alive is sent [ns]."""
 AGAIN_NS = SECOND_NS
-"""Time after which the first observation is sent again."""
+"""Time between repetitions of the first observation [ns]."""
 STEP_NS_FIRST = 50 * MILLISECOND_NS
-"""Length of a step before it is measured."""
+"""Assumed length of a control step before it is measured [ns]."""
 STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
-"""Bounds of what is measured: a program that pauses for a minute plays no row for a minute."""
+"""Bounds of the measured step length [ns]: a pause of the program is not a long step."""
 MEASURED, DELAYS, ASKED_MAX = 9, 64, 1024
-"""Number of newest intervals and delays that are measured, and of observations whose chunks are
-played."""
+"""Number of newest call intervals evaluated, of chunk delays evaluated, and of sent observations
+whose chunks are accepted."""
 ROWS_SENT = 64
-"""Largest number of coming rows that are sent with an observation."""
+"""Largest number of next rows that are sent with an observation."""
 CALL_COLUMNS = np.dtype(
     [
         ("time_ns", "<i8"),  # time of the answer
@@ -66,47 +70,51 @@ CALL_COLUMNS = np.dtype(
         ("call", "<i8"),  # number of the call
         ("kind", "u1"),  # 0 fresh, 1 rest, 2 hold, 3 error
         ("waited_ns", "<i8"),  # time from the call to the answer
-        ("chunk_age_ns", "<i8"),  # age of the observation that the answer was made from, -1: none
-        ("left", "<i8"),  # rows of the answer that the policy has made
+        ("chunk_age_ns", "<i8"),  # age of the newest chunk's observation, -1: no chunk yet
+        ("left", "<i8"),  # rows of the answer computed by the policy
     ]
 )
 KINDS = (Kind.FRESH, Kind.REST, Kind.HOLD, Kind.ERROR)
 
 
-class Said(bytes, Enum):
-    """First byte of what a line hears and sends."""
+class FrameType(bytes, Enum):
+    """First byte of a frame of a local connection, received or sent."""
 
     OPENED = b"+"
     CLOSED = b"-"
-    """The rest is the reason, or empty."""
+    """Followed by the reason, or nothing."""
     MESSAGE = b"m"
     ERROR = b"e"
-    """The rest is a text."""
+    """Followed by the error message."""
 
 
 @dataclass(frozen=True)
 class RobotOptions:
+    """Options of a robot end."""
+
     actions: Actions
     deadline_ns: int
+    """Longest time from a call to its answer, except for the first call [ns]."""
     hold_ns: int = SECOND_NS
-    """Longest time for which a robot without rows is held."""
+    """Longest time for which calls are answered with the hold action [ns]."""
     begin_ns: int = 60 * SECOND_NS
-    """Longest time for the first answer."""
+    """Longest time from the first call to its answer [ns]."""
     key: str = "actions"
     """Key of the actions in the policy's reply."""
     step_ns: int | None = None
-    """Length of a step; None: measured, as the time from an answer to the next call, in which a
-    robot that `plays_on` does not play just its rows."""
+    """Length of a control step [ns]; None: measured as the time from an answer to the next call,
+    divided by `rows`. Required with `plays_on`, where that time is no multiple of the step."""
     rows: int = 1
-    """Number of rows that the program plays of each answer, from which the step is measured."""
+    """Number of rows that the program executes of each answer."""
     plays_on: bool = False
-    """Whether the robot plays on while its program waits for an answer."""
+    """Whether the robot continues to execute rows during a call."""
     spare_rows: int | None = None
-    """An observation is sent only if fewer rows than these will be left when its chunk comes; None
-    sends each."""
+    """An observation is sent only if fewer rows will remain when its chunk arrives; None: each is
+    sent."""
     rate_max: float = RATE_MAX
-    """Bound of the rate at which it sends [B/s]."""
+    """Largest send rate [B/s]."""
     player: Callable[[], Player] = Clocked
+    """Makes the rule that chooses the row of each step."""
 
 
 @dataclass(slots=True)
@@ -115,9 +123,9 @@ class _Call:
     began_ns: int
     is_first: bool
     message: bytes
-    """Observation as it is sent; empty if it is not."""
+    """Serialized observation; empty if it is not sent."""
     again_ns: int
-    """Time at which it is sent again, if no answer has ever come."""
+    """Time at which the observation is sent again, before the first chunk [ns]."""
 
 
 class _Asked(NamedTuple):
@@ -125,39 +133,41 @@ class _Asked(NamedTuple):
 
     began_ns: int
     first: int
-    """Number of the first row of its chunk."""
+    """Step of the first row of its chunk."""
     stood_ns: float
-    """Time for which the robot had stood still until then [ns]."""
+    """`Schedule.stood_ns` at the observation [ns]."""
     connection: int
+    """Number of the program's connection."""
 
 
 @dataclass(slots=True)
 class _Program:
-    """The robot's program, from its connection on."""
+    """Connected robot program."""
 
     peer: Address
     number: int
     schedule: Schedule
     intervals_ns: deque[int]
-    """Newest times from an answer to the next call; the first is a guess."""
+    """Newest times from an answer to the next call [ns]; the first is an assumed value."""
     newest: int = -1
-    """Number of the observation that the newest chunk was made from."""
+    """Number of the newest call whose chunk has arrived; -1: none."""
     made_ns: int = -1
-    """Time of that observation [ns]."""
+    """Time of that call [ns]."""
     answered_ns: int | None = None
+    """Time of the last answer [ns]."""
     has_metadata: bool = False
 
 
 class RobotEnd(Endpoint):
-    """Robot's end of a session with a policy server.
+    """Robot end of a session with a policy end.
 
     Args:
-        robot: number of the robot, unique among those of the server.
-        servers: the server's address on each path, by socket; socket 1 is the line.
-        link: see `client.link`.
+        robot: number of the robot, unique at the policy end.
+        servers: address of the policy end on each path, by socket number, without LINE.
+        link: encryption of the datagrams, see `client.link`.
         boot_id: random number of this run.
-        compress: changes an observation into what is sent of it, see `images.Compressor`.
-        recorder: of CALL_COLUMNS, a row for each answer.
+        compress: compresses an observation before it is sent, see `images.Compressor`.
+        recorder: records an entry of CALL_COLUMNS for each answer.
     """
 
     def __init__(
@@ -177,31 +187,32 @@ class RobotEnd(Endpoint):
         self._recorder = recorder
         self._exchange: Exchange | None = None
         self._session = (0, 0)
-        """Number of the session, and of the server's run."""
+        """Number of the session, and of the policy end's run."""
         self._hello_ns: int | None = 0
-        """Time of the next HELLO; None while there is a session."""
+        """Time of the next HELLO [ns]; None during a session."""
         self._heard_ns = self._sent_ns = 0
         self._metadata: bytes | None = None
         self._wants_rows = False
-        """Whether the policy wants to know which rows are coming."""
+        """Whether observations include the next rows, for `PolicyEnd.gives_rows`."""
         self._program: _Program | None = None
         self._call: _Call | None = None
         self._asked: dict[int, _Asked] = {}
-        """Observations that were sent, by number."""
+        """Sent observations, by call number."""
         self._calls = self._connections = 0
         self._waits = True
-        """Whether the newest chunk came within the deadline, so that it is worth waiting for the
-        next."""
+        """Whether the newest chunk arrived within the deadline; if not, a call is answered at once
+        while rows remain."""
         self._delays_ns: deque[int] = deque(maxlen=DELAYS)
-        """Newest times from an observation to its chunk."""
+        """Newest times from an observation to its chunk [ns]."""
         self._counts = Counter[Kind]()
         self._drops = Counter[str]()
         self._refused = 0
         self._late_ns = 0
-        """Longest time by which an answer came after its deadline."""
+        """Longest time from a deadline to its answer [ns]."""
         self._is_holding = False
         self._age_ns, self._left = -1, 0
-        """Age of the newest answer's observation [ns], -1: none, and its rows by the policy."""
+        """At the last answer: age of the newest chunk's observation [ns], -1: no chunk; and number
+        of rows computed by the policy."""
 
     # -- datagrams -----------------------------------------------------------------------------
 
@@ -229,7 +240,7 @@ class RobotEnd(Endpoint):
         if isinstance(message, Hello) or exchange is None or message.session != exchange.session:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
         self._heard_ns = now_ns
-        if isinstance(message, Seen):
+        if isinstance(message, Report):
             if message.came:
                 exchange.learn(message, now_ns=now_ns)
         elif arrived := exchange.accept(message, now_ns=now_ns):
@@ -256,10 +267,10 @@ class RobotEnd(Endpoint):
         self._say_alive()
 
     def _say_alive(self) -> None:
-        """Say that the robot is there, and whether it has the policy's metadata."""
+        """Send a keep-alive, which includes whether the policy's metadata has arrived."""
         assert self._exchange
         has = int(self._metadata is not None)
-        self._post(encode(Seen(self._exchange.session, METADATA, has, 0, 0, 0, 0, 0, 0)))
+        self._post(encode(Report(self._exchange.session, METADATA, has, 0, 0, 0, 0, 0, 0)))
 
     def _learn_metadata(self, message: bytes) -> None:
         try:
@@ -279,7 +290,7 @@ class RobotEnd(Endpoint):
             self.send(datagram, server, socket)
 
     def _send(self, now_ns: int) -> None:
-        """Send what is due."""
+        """Send all datagrams that are due."""
         if self._hello_ns is not None and now_ns >= self._hello_ns:
             self._hello_ns = now_ns + self._link.hello_ns
             hello = encode(Hello(self._robot, self._boot_id))
@@ -297,11 +308,11 @@ class RobotEnd(Endpoint):
             self._sent_ns = now_ns
             self._say_alive()
 
-    # -- the program ---------------------------------------------------------------------------
+    # -- robot program -------------------------------------------------------------------------
 
     def _hear_program(self, said: bytes, peer: Address, now_ns: int) -> None:
         match said[:1]:
-            case Said.OPENED:
+            case FrameType.OPENED:
                 options = self._options
                 step_ns = options.step_ns or STEP_NS_FIRST
                 player = options.player()
@@ -316,26 +327,26 @@ class RobotEnd(Endpoint):
                 self._call = None
                 self._events.append(events.ProgramConnected(robot=self._robot))
                 self._greet()
-            case Said.CLOSED if self._program and self._program.peer == peer:
+            case FrameType.CLOSED if self._program and self._program.peer == peer:
                 self._program = self._call = None
                 self._events.append(events.ProgramGone(robot=self._robot))
-            case Said.MESSAGE if self._program and self._program.peer == peer:
+            case FrameType.MESSAGE if self._program and self._program.peer == peer:
                 self._hear_call(self._program, said[1:], now_ns)
 
     def _greet(self) -> None:
-        """Give the program the policy's metadata, by which its connection is complete."""
+        """Send the policy's metadata to the program, which completes its connection."""
         program = self._program
         if program and self._metadata is not None and not program.has_metadata:
             program.has_metadata = True
-            self.send(Said.MESSAGE.value + self._metadata, program.peer, LINE)
+            self.send(FrameType.MESSAGE.value + self._metadata, program.peer, LINE)
 
     def _hear_call(self, program: _Program, data: bytes, now_ns: int) -> None:
         options, schedule = self._options, program.schedule
-        if self._call:  # the program does not wait for its answers; each gets its own
+        if self._call:  # the program has not waited for its answer; each call gets one
             self._answer(Kind.REST, now_ns)
         if program.answered_ns is not None and options.step_ns is None:
             program.intervals_ns.append(now_ns - program.answered_ns)
-            # The lower quartile: a program may pause more often than it calls without playing.
+            # Lower quartile: long pauses are more frequent than calls without executed rows.
             measured_ns = sorted(program.intervals_ns)[len(program.intervals_ns) // 4]
             step_ns = measured_ns // options.rows
             schedule.step_ns = min(max(step_ns, STEP_NS_LEAST), STEP_NS_MOST)
@@ -373,13 +384,13 @@ class RobotEnd(Endpoint):
         if self._exchange:
             self._exchange.send(OBSERVATION, message)
         before = self._asked.get(call.number - 1)
-        if before and program.newest < call.number - 1:  # its chunk has not come yet
+        if before and program.newest < call.number - 1:  # its chunk has not arrived yet
             self._waits &= now_ns - before.began_ns <= options.deadline_ns
         if not (self._waits or call.is_first) and schedule.left(now_ns=now_ns):
             self._answer(Kind.REST, now_ns)
 
     def _delay_steps(self, schedule: Schedule) -> int:
-        """Steps within which a chunk comes, after its observation, by the newest delays."""
+        """Longest of the newest times from an observation to its chunk, in control steps."""
         longest_ns = max(self._delays_ns, default=0)
         return -(-longest_ns // schedule.step_ns)
 
@@ -389,7 +400,7 @@ class RobotEnd(Endpoint):
         return spare is None or not left or left < spare + self._delay_steps(schedule)
 
     def _accept(self, message: bytes, now_ns: int) -> None:
-        """Accept a chunk."""
+        """Accept a chunk or an error of the policy."""
         try:
             call_number, reply, error = values.unpack(message)
             if type(call_number) is not int:
@@ -419,7 +430,7 @@ class RobotEnd(Endpoint):
             self._answer(Kind.FRESH, now_ns)
 
     def _answer(self, kind: Kind, now_ns: int, error: str = "") -> None:
-        """Answer the call."""
+        """Answer the present call."""
         program, call = self._program, self._call
         assert program
         assert call
@@ -433,7 +444,7 @@ class RobotEnd(Endpoint):
             try:
                 kind, reply, left = schedule.answer(kind, now_ns=now_ns)
                 message = values.pack(reply)
-            except (ValueRefused, RecursionError) as refused:  # nested too deep
+            except (ValueRefused, RecursionError) as refused:  # nested too deeply
                 error = f"the policy's reply cannot be sent: {refused}"
         if kind is Kind.HOLD and not error:
             if reply is None or now_ns - since_ns > self._options.hold_ns:
@@ -456,9 +467,9 @@ class RobotEnd(Endpoint):
             row = (now_ns, self._robot, call.number, KINDS.index(kind), waited_ns, age_ns, left)
             self._recorder.append_row(*row)
         if error:
-            self.send(Said.ERROR.value + error.encode(), program.peer, LINE)
+            self.send(FrameType.ERROR.value + error.encode(), program.peer, LINE)
         else:
-            self.send(Said.MESSAGE.value + message, program.peer, LINE)
+            self.send(FrameType.MESSAGE.value + message, program.peer, LINE)
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -483,7 +494,7 @@ class RobotEnd(Endpoint):
         if call and now_ns >= self._answer_by_ns(call):
             self._answer(Kind.REST, now_ns)
         elif call and call.is_first and call.message and now_ns >= call.again_ns:
-            # The robot waits for its first answer, and no other observation follows.
+            # The program waits for its first answer, and sends no other observation.
             call.again_ns = now_ns + AGAIN_NS
             if self._exchange:
                 self._exchange.send(OBSERVATION, call.message)

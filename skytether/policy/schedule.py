@@ -1,10 +1,11 @@
-"""Rows of actions that a robot holds, and the answer to its program at any time.
+"""Received action chunks of a robot, and the reply to its program at a given time.
 
-Rows are played by the clock, `step_ns` each. While the robot stands still, so does the count of its
-steps: when the rows that its program was given have run out, and, with a program that waits for
-each answer, until it has come. The first row of a chunk that was made from an observation at that
-place is then the next one, and nothing is left out. The robot has not moved since, but all about it
-may have: a chunk is forgotten when its rows would be played more than `late_ns` after their time.
+A row is the action of one control step of length `step_ns`. The step counter follows the clock. It
+is paused while the robot executes no row: when all rows of the program's last answer are executed,
+and, with a program that waits for each answer, during the call. Thus a chunk computed from an
+observation during a pause starts with the next row, and no row is skipped. The robot has not moved
+during a pause, but its surroundings may have changed: a chunk is discarded if its rows would be
+executed more than `late_ns` after their planned time.
 """
 
 from copy import copy
@@ -21,39 +22,40 @@ from skytether.shared.base.units import SECOND_NS
 ROWS_MAX = 1024
 """Largest number of rows of a chunk."""
 Actions = Literal["absolute", "delta"]
-"""What to hold means: the last row again, or zeros."""
+"""Type of the actions, which sets the hold action: last row for absolute, zeros for delta."""
 
 
 class Kind(StrEnum):
-    """What a call was answered with."""
+    """Kind of an answer to a call."""
 
     FRESH = "fresh"
-    """The chunk that was made from its own observation."""
+    """Chunk computed from the observation of this call."""
     REST = "rest"
-    """Rows left of earlier chunks."""
+    """Remaining rows of earlier chunks."""
     HOLD = "hold"
-    """No row was left, so what holds the robot."""
+    """Hold action: no row remains."""
     ERROR = "error"
 
 
 class Answer(NamedTuple):
     kind: Kind
     reply: Any
-    """The policy's reply, from the present row on; None if there is none yet."""
+    """Newest reply from the present row on; None before the first."""
     left: int
-    """Number of rows in it that the policy has made."""
+    """Number of rows of `reply` computed by the policy; the others are the hold action."""
 
 
 class Schedule:
-    """Rows of one robot, from the connection of its program on.
+    """Chunks and step counter of one robot program, from its connection on.
 
     Args:
+        player: rule that chooses the row of each step.
         actions: see `Actions`.
         key: key of the actions in the policy's reply.
-        step_ns: length of a step [ns].
-        rows: number of rows that the program plays of each answer; None: as long as it takes.
-        late_ns: longest time by which a row is played later than it was planned for [ns].
-        began_ns: time of step 0.
+        step_ns: length of a control step [ns].
+        rows: number of rows that the program executes of each answer; None: counted by the clock.
+        late_ns: longest allowed delay of a row after its planned time [ns].
+        began_ns: time of step 0 [ns].
     """
 
     def __init__(
@@ -73,35 +75,37 @@ class Schedule:
         self._end = 0
         """First step without a row."""
         self._given = 0
-        """The same of the rows that the program has: it plays its answer, whatever comes later."""
+        """First step without a row in the program's last answer; later chunks do not change it."""
         self._reply: Any = None
         self._newest = -1
-        """Call that the reply is an answer to."""
+        """Number of the call that `_reply` answers."""
         self._first = 0
+        """Step of the first row of `_reply`, as the player counts steps."""
         self._stands = False
-        """Whether the robot stands still now, although rows may be left."""
+        """Whether the step counter is paused by a call, although rows may remain."""
         self.stood_ns = 0.0
-        """Time for which it has stood still so far [ns]."""
+        """Total time for which the step counter has been paused [ns]."""
         self._made: dict[int, float] = {}
-        """The same when the observation of each chunk was made, by its call [ns]."""
+        """`stood_ns` at the observation of each chunk, by call number [ns]."""
         self.since_ns: int | None = began_ns
-        """Time since which the program has had no row [ns]; None while it has."""
+        """Time at which the program ran out of rows [ns]; None while rows remain."""
 
     def stand(self, *, now_ns: int) -> None:
-        """Stand still until `go`: the program waits for an answer. It calls between two rows, so
-        the count becomes a whole number.
+        """Pause the step counter until `go`, while the program waits for an answer.
+
+        A call is made between two rows, so the counter is rounded to a whole number.
         """
         played = self._given if self._rows else round(self._by_clock(now_ns))
         self._move(max(played, int(self._count)), now_ns)
         self._stands = True
 
     def go(self, *, now_ns: int) -> None:
-        """Play on, as far as the program is given an answer."""
+        """Continue the step counter when the program gets its answer."""
         self._given = self.advance(now_ns=now_ns)
         self._stands = False
 
     def advance(self, *, now_ns: int) -> int:
-        """Play the rows until now; returns the number of the present step."""
+        """Advance the step counter to `now_ns`; returns the number of the present step."""
         self._move(max(self._by_clock(now_ns), self._count), now_ns)
         return int(self._count)
 
@@ -125,7 +129,7 @@ class Schedule:
         return self.stood_ns - stood_ns > self._late_ns
 
     def _forget(self) -> None:
-        """Forget chunks that are late, and what is known of those that are played."""
+        """Discard chunks that are too late, and the records of chunks without remaining rows."""
         held = self._player.held
         held = tuple(each for each in held if not self._is_late(self._made[each.generation]))
         self._player.held = held
@@ -134,33 +138,38 @@ class Schedule:
         self._end = step + len(self._coming(step, ROWS_MAX + HELD_MAX)[0])
 
     def number(self, *, now_ns: int) -> int:
-        """The player's number of the present step, from which a chunk counts its rows."""
+        """Number of the present step as the player counts steps; a chunk begins with this step."""
         return self._player.number(self.advance(now_ns=now_ns))
 
     def accept(self, call: int, first: int, stood_ns: float, reply: Any, *, now_ns: int) -> None:
         """Accept a chunk.
 
         Args:
-            call: number of the call that it answers; that of a newer one is higher.
+            call: number of the call that it answers; numbers increase.
             first: number of the step of its observation, see `number`.
-            stood_ns: `stood_ns` at that time.
+            stood_ns: `stood_ns` at the time of its observation [ns].
+            reply: the policy's reply.
 
         Raises:
-            ValueRefused: the reply has no rows of actions, or other ones than those before, or it
-                is too late for them.
+            ValueRefused: the reply has no valid rows, its row shape has changed, or the chunk is
+                more than `late_ns` late.
         """
         rows = rows_of(reply, self._key).astype(np.float64)
         step = self.advance(now_ns=now_ns)
         if self._reply is not None:
             before = rows_of(self._reply, self._key).shape[1:]
             if before != rows.shape[1:]:
-                raise ValueRefused(f"{self._key}: got rows of {rows.shape[1:]}, expected {before}")
+                raise ValueRefused(
+                    f"{self._key}: got row shape {rows.shape[1:]}, expected {before} as before"
+                )
         if self._reply is None:
-            stood_ns = self.stood_ns  # the robot has not moved yet, however long it has waited
+            stood_ns = (
+                self.stood_ns
+            )  # first chunk: the robot has not moved yet, so it is never late
         elif self._is_late(stood_ns):
             late_s = (self.stood_ns - stood_ns) / SECOND_NS
-            why = f"the robot has stood still since its observation for {late_s:.1f} s"
-            raise ValueRefused(f"{why}, longer than deadline and hold")
+            why = f"the robot has paused for {late_s:.1f} s since its observation"
+            raise ValueRefused(f"{why}, expected at most the sum of deadline and hold")
         self._made[call] = stood_ns
         self._player.accept(Held(call, first, rows), step)
         if call > self._newest:
@@ -168,24 +177,26 @@ class Schedule:
         self._forget()
 
     def left(self, *, now_ns: int) -> int:
-        """Number of rows that are left."""
+        """Number of remaining rows."""
         return self._end - self.advance(now_ns=now_ns)
 
     def coming(self, count: int, *, now_ns: int) -> NDArray[Any] | None:
-        """Rows that are played next, at most `count`; shape (n, *row), None before the first."""
+        """Next rows to execute, at most `count`; shape (n, *row), None if no row remains."""
         rows, _ = self._coming(self.advance(now_ns=now_ns), count)
         return np.stack(rows) if rows else None
 
     def _coming(self, step: int, count: int) -> tuple[list[Row], Row | None]:
-        """Rows from a step on, and the last row that was played if they are none."""
+        """At most `count` rows from a step on, and the row to repeat when rows have run out."""
         player, rows = copy(self._player), list[Row]()
         while len(rows) < count and (row := player.row(step + len(rows))) is not None:
             rows.append(row)
         return rows, player.last
 
     def answer(self, kind: Kind, *, now_ns: int) -> Answer:
-        """Reply from the present row on, as long as the newest one, filled up with what holds the
-        robot.
+        """Newest reply from the present row on, padded to its length with the hold action.
+
+        Args:
+            kind: kind of the answer if rows remain; else it is HOLD.
         """
         if self._reply is None:
             return Answer(Kind.HOLD, None, 0)
@@ -208,10 +219,10 @@ class Schedule:
 
 
 def rows_of(reply: Any, key: str) -> NDArray[Any]:
-    """Rows of actions in a policy's reply.
+    """Rows of actions in a policy's reply; shape (n, *row).
 
     Raises:
-        ValueRefused: there are none, or too many, or one is not finite.
+        ValueRefused: the reply has no rows or more than ROWS_MAX, or a number is not finite.
     """
     rows = reply.get(key) if isinstance(reply, dict) else None
     if not isinstance(rows, np.ndarray) or rows.ndim < 1 or not 0 < len(rows) <= ROWS_MAX:
@@ -219,14 +230,12 @@ def rows_of(reply: Any, key: str) -> NDArray[Any]:
         what = f"an array of shape {shape}" if shape is not None else type(rows).__name__
         raise ValueRefused(f"{key}: got {what}, expected an array with 1 to {ROWS_MAX} rows")
     if rows.dtype.kind not in "iuf" or not np.isfinite(rows).all():
-        raise ValueRefused(f"{key}: got {rows.dtype} or no finite number, expected finite numbers")
+        raise ValueRefused(f"{key}: got {rows.dtype} or NaN or infinity, expected finite numbers")
     return rows
 
 
 def _cut(value: Any, length: int, first: int) -> Any:
-    """Value in which arrays of the same length begin with a row, and end with copies of their last
-    row.
-    """
+    """Value with each array of `length` rows shifted by `first` rows, its last row repeated."""
     if isinstance(value, dict):
         return {name: _cut(each, length, first) for name, each in value.items()}
     if isinstance(value, np.ndarray) and value.ndim and len(value) == length and first:

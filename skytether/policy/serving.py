@@ -1,9 +1,9 @@
-"""The policy's end: observations of robots in, chunks of actions out.
+"""Policy end: receives observations of robots and sends them the policy's action chunks.
 
-The policy speaks through the line (socket 1): openpi's websocket protocol, with a connection for
-each robot, or a function. While it thinks, a newer observation of the same robot takes the place of
-one that waits. An error, or a connection that was lost, reaches the robot as an error, and its rows
-play on.
+The policy is connected through the local connection (socket 1): a websocket connection for each
+robot, with openpi's protocol, or a function. While the policy computes a chunk, only the newest
+further observation of the robot is kept. An error of the policy, or a lost websocket connection, is
+sent to the robot end as an error, and the robot continues with its remaining rows.
 """
 
 from collections import Counter, OrderedDict
@@ -24,7 +24,7 @@ from skytether.policy.messages import (
     encode,
 )
 from skytether.policy.pace import RATE_MAX
-from skytether.policy.robot import LINE, Said
+from skytether.policy.robot import LINE, FrameType
 from skytether.policy.values import ValueRefused
 from skytether.server.gate import Gate, GateCall, ReplyPath
 from skytether.shared.base.units import SECOND_NS
@@ -33,25 +33,26 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Refusal
 
 ROBOTS_MAX = 64
-"""Largest number of robots at once."""
+"""Largest number of robots with a session."""
 SILENCE_NS = 10 * SECOND_NS
-"""Time after which a silent robot's session ends."""
+"""Time without a datagram after which a robot's session ends [ns]."""
 PATH_NS = 3 * SECOND_NS
-"""Time without a packet from an address after which nothing is sent there."""
+"""Time without a datagram from an address after which no datagram is sent to it [ns]."""
 PATHS_MAX = 4
+"""Largest number of addresses of a robot; the least recently used are discarded."""
 AGAIN_NS = SECOND_NS
-"""Time after which a connection to the policy that was lost is opened again."""
+"""Time after which a lost connection to the policy is reopened [ns]."""
 POLICY = "policy"
-"""Peer of the line: `(POLICY, connection)`; a number is never used again, so that an answer that
-comes after its connection's end is nobody's."""
+"""Peer of the local connection: `(POLICY, connection)`. Connection numbers are not reused, so that
+a reply after the end of its connection is ignored."""
 
 
 class _Job(NamedTuple):
-    """Observation that the policy is asked for an answer to."""
+    """Observation for the policy."""
 
     call: int
     is_urgent: bool
-    """Whether the robot has no more rows than come before the chunk does."""
+    """Whether the robot's rows are expected to run out before the chunk arrives."""
     observation: bytes
 
 
@@ -62,18 +63,21 @@ class _Robot:
     exchange: Exchange
     heard_ns: int
     paths: "OrderedDict[tuple[int, Address], int]" = field(default_factory=OrderedDict)
-    """Time of the newest packet [ns] of each socket and address, newest last."""
+    """Time of the newest datagram [ns] of each socket and address, newest last."""
     waiting: _Job | None = None
+    """Newest observation that the policy has not got yet."""
     thinking: _Job | None = None
+    """Observation for which the policy computes a chunk."""
     answered: tuple[int, bytes] = (-1, b"")
-    """Newest call that was answered, and the chunk."""
+    """Number of the newest call with a chunk, and the message with that chunk."""
     asked_ns: int = 0
-    """Time at which the policy was asked, or its connection opened [ns]."""
+    """Time at which the policy got the observation, or opening its connection began [ns]."""
     is_open: bool = False
     """Whether the connection to the policy is open."""
     connection: int = 0
+    """Number of the connection to the policy."""
     opens_ns: int = 0
-    """Time at which it is opened next, if it is not."""
+    """Time at which a closed connection is reopened [ns]."""
     is_opening: bool = False
     has_metadata: bool = False
 
@@ -82,7 +86,7 @@ class _Robot:
         return self.exchange.session
 
     def hear(self, line: ReplyPath, datagram: Datagram, now_ns: int) -> None:
-        """Note from where a packet has come."""
+        """Record the source of a datagram."""
         at = datagram.socket, datagram.peer
         self.reply, self.heard_ns, self.paths[at] = line, now_ns, now_ns
         self.paths.move_to_end(at)
@@ -91,18 +95,20 @@ class _Robot:
 
 
 class PolicyEnd(Endpoint):
-    """Policy's end of the sessions of several robots.
+    """Policy end of the sessions of several robots.
 
     Args:
-        gate: see `server.gate`.
+        gate: decryption and admission of robots, see `server.gate`.
         boot_id: random number of this run.
-        draw: returns an unpredictable number of 32 bits, for sessions.
-        patience_ns: longest time that the policy may think; then its connection is opened anew.
-        gives_rows: whether an observation gets the keys `delay_steps`, `coming` and `committed`:
-            the rows that the robot plays from the observation's step on, as far as it has them, and
-            those of them that it plays before a chunk can come.
-        rate_max: bound of the rate at which a robot is sent to [B/s].
-        unpacker: makes what makes an observation's images of those of `images.Compressor`.
+        draw: returns an unpredictable 32-bit number, used as session number.
+        patience_ns: longest computation time of the policy; then its connection is reopened [ns].
+        gives_rows: whether the keys `delay_steps`, `coming` and `committed` are added to an
+            observation: the longest recent time from observation to chunk in control steps, the
+            robot's remaining rows from the observation's step on, and the first `delay_steps` of
+            them, which are executed before the chunk arrives.
+        rate_max: largest send rate to each robot [B/s].
+        unpacker: makes the hook that decompresses the images of one observation, see
+            `images.Unpacker`; None: images are not compressed.
     """
 
     def __init__(
@@ -122,7 +128,7 @@ class PolicyEnd(Endpoint):
         self._unpacker = unpacker
         self._robots: dict[int, _Robot] = {}
         self._welcomed: dict[int, _Robot] = {}
-        """Robots of which nothing has come but a HELLO, which may be a repeat of an earlier run."""
+        """Robots, by number, that have sent only a HELLO, which may be a replay of an old one."""
         self._by_connection: dict[int, int] = {}
         """Number of the robot of each connection to the policy."""
         self._connections = 0
@@ -167,16 +173,16 @@ class PolicyEnd(Endpoint):
             return
         if message.came:
             robot.exchange.learn(message, now_ns=now_ns)
-        else:  # the robot says that it is there, and whether it has the metadata; so is the server
+        else:  # keep-alive, which includes whether the robot end has the metadata; it is echoed
             robot.has_metadata = message.number > 0
             self.send(call.line.seal(call.payload), datagram.peer, datagram.socket)
             self._give_metadata(robot)
 
     def _number(self, session: int, call: GateCall, now_ns: int) -> int:
-        """Number of the robot of a session.
+        """Number of the robot that has this session.
 
         Raises:
-            ProtocolError: there is no such session, or it is another robot's.
+            ProtocolError: the session does not exist or belongs to another robot.
         """
         if call.vehicle is not None:
             welcomed = self._welcomed.get(call.vehicle)
@@ -200,7 +206,7 @@ class PolicyEnd(Endpoint):
         if present is None and len(self._robots) >= ROBOTS_MAX:
             refusal = Refusal.FULL
         elif present and call.vehicle is None and hello.boot_id != present.boot_id:
-            # Without keys anybody may say that number; the robot that is there keeps it.
+            # Without keys anybody may send this number; the robot with a session keeps it.
             is_silent = now_ns - present.heard_ns >= PATH_NS
             is_here = (datagram.socket, datagram.peer) in present.paths
             refusal = Refusal.ACCEPTED if is_silent or is_here else Refusal.TAKEN
@@ -228,8 +234,8 @@ class PolicyEnd(Endpoint):
         return session
 
     def _begin(self, number: int, now_ns: int) -> None:
-        """Begin the session of a robot that was welcomed; it has a connection to the policy of its
-        own, for an episode begins.
+        """Begin the session of a robot that got a WELCOME, with a new connection to the policy,
+        since a new episode begins.
         """
         before, robot = self._robots.get(number), self._welcomed.pop(number)
         if before:
@@ -245,11 +251,11 @@ class PolicyEnd(Endpoint):
         self._connections += 1
         robot.is_opening, robot.asked_ns, robot.connection = True, now_ns, self._connections
         self._by_connection[robot.connection] = number
-        self.send(Said.OPENED.value, (POLICY, robot.connection), LINE)
+        self.send(FrameType.OPENED.value, (POLICY, robot.connection), LINE)
 
     def _close(self, robot: _Robot) -> None:
         self._by_connection.pop(robot.connection, None)
-        self.send(Said.CLOSED.value, (POLICY, robot.connection), LINE)
+        self.send(FrameType.CLOSED.value, (POLICY, robot.connection), LINE)
 
     def _hear_policy(self, said: bytes, connection: int, now_ns: int) -> None:
         number = self._by_connection.get(connection)
@@ -257,22 +263,22 @@ class PolicyEnd(Endpoint):
             return
         robot = self._robots[number]
         match said[:1]:
-            case Said.OPENED:
+            case FrameType.OPENED:
                 robot.is_open, robot.is_opening = True, False
                 self._metadata = said[1:]
                 self._events.append(events.UpstreamFound(robot=number))
                 self._give_metadata(robot)
-            case Said.CLOSED:
+            case FrameType.CLOSED:
                 self._lose(number, robot, said[1:].decode(errors="replace"), now_ns)
                 return
             case _ if robot.thinking is None:
-                # Else the next observation would get this answer, and each further one that before.
-                self._lose(number, robot, "it answers what it was not asked", now_ns)
+                # Else each later observation would get the reply to the one before.
+                self._lose(number, robot, "reply without an observation", now_ns)
                 return
-            case Said.MESSAGE:
+            case FrameType.MESSAGE:
                 self._counts["answers"] += 1
                 self._finish(robot, said[1:], "")
-            case Said.ERROR:
+            case FrameType.ERROR:
                 reason = said[1:].decode(errors="replace").strip() or "unknown"
                 self._counts["errors"] += 1
                 last = reason.splitlines()[-1][:200]
@@ -287,18 +293,18 @@ class PolicyEnd(Endpoint):
         self._close(robot)
         robot.is_open = robot.is_opening = False
         robot.opens_ns = now_ns + AGAIN_NS
-        self._finish(robot, b"", f"the policy's connection was lost: {reason[:100]}")
+        self._finish(robot, b"", f"connection to the policy lost: {reason[:100]}")
 
     def _finish(self, robot: _Robot, reply: bytes, error: str) -> None:
-        """Send the answer to the observation that the policy was asked about."""
+        """Send the policy's reply, or an error, to the robot."""
         job, robot.thinking = robot.thinking, None
         if job is None:
             return
         message = values.pack([job.call, reply, error])
         if len(message) > values.BYTES_MAX:
-            error = f"the policy's reply has {len(message)} B"
+            error = f"the policy's reply has {len(message)} B, expected at most {values.BYTES_MAX}"
             message = values.pack([job.call, b"", error])
-        if not error:  # else the robot may ask again
+        if not error:  # after an error the robot may send the observation again
             robot.answered = job.call, message
         robot.exchange.send(CHUNK, message, is_urgent=job.is_urgent)
 
@@ -314,7 +320,7 @@ class PolicyEnd(Endpoint):
             if not all(type(each) is int for each in (call, left, delay)):
                 raise ProtocolError(Drop.FIELD)
             if any(job and job.call == call for job in (robot.thinking, robot.waiting)):
-                return  # sent again
+                return  # a repeated observation
             if call == robot.answered[0]:
                 robot.exchange.send(CHUNK, robot.answered[1], is_urgent=True)
                 return
@@ -332,11 +338,11 @@ class PolicyEnd(Endpoint):
         self._ask(robot, now_ns)
 
     def _ask(self, robot: _Robot, now_ns: int) -> None:
-        """Ask the policy about the newest observation, if it is free."""
+        """Send the newest observation to the policy, if it is idle."""
         if robot.waiting and robot.is_open and robot.thinking is None:
             robot.thinking, robot.waiting = robot.waiting, None
             robot.asked_ns = now_ns
-            said = Said.MESSAGE.value + robot.thinking.observation
+            said = FrameType.MESSAGE.value + robot.thinking.observation
             self.send(said, (POLICY, robot.connection), LINE)
 
     # -- time ----------------------------------------------------------------------------------
@@ -365,7 +371,7 @@ class PolicyEnd(Endpoint):
             is_asked = robot.thinking or robot.is_opening
             if is_asked and now_ns - robot.asked_ns >= self._patience_ns:
                 waited_s = self._patience_ns / SECOND_NS
-                self._lose(number, robot, f"no answer in {waited_s:g} s", now_ns)
+                self._lose(number, robot, f"no reply within {waited_s:g} s", now_ns)
             if not (robot.is_open or robot.is_opening) and now_ns >= robot.opens_ns:
                 self._open(number, robot, now_ns)
         self._send(now_ns)

@@ -1,8 +1,8 @@
-"""Observations and actions as bytes, as openpi sends them: msgpack with numpy arrays.
+"""Serialization of observations and actions in openpi's format: msgpack with numpy arrays.
 
-An array is a map with the keys `__ndarray__`, `data`, `dtype` and `shape` as bytes, a numpy number
-one with `__npgeneric__`, `data` and `dtype`. Only arrays of numbers and booleans are accepted:
-nothing is unpickled, and no array is larger than its bytes.
+An array is a map with the byte-string keys `__ndarray__`, `data`, `dtype` and `shape`; a numpy
+scalar is a map with `__npgeneric__`, `data` and `dtype`. Only numbers and booleans are accepted as
+elements: nothing is unpickled, and the shape of an array must match the size of its data.
 """
 
 import re
@@ -16,22 +16,23 @@ from numpy.typing import NDArray
 
 ARRAY, GENERIC = b"__ndarray__", b"__npgeneric__"
 BYTES_MAX = 4_000_000
-"""Largest size of a value that is sent [B]: 20 MB of raw images would take seconds at 10 Mbit/s."""
+"""Largest serialized value that is sent [B]; 20 MB of raw images would take 16 s at 10 Mbit/s."""
 MADE_BYTES_MAX = 64_000_000
-"""Largest size of a value before it is compressed, and of its images after it [B]."""
+"""Largest serialized value before compression, and largest sum of its decompressed images [B]."""
 AXES_MAX = 8
 _DTYPE = re.compile(r"[<>|=]?[biuf][1248]|[<>|=]?f16")
 
 
 class ValueRefused(ValueError):
-    """Bytes that are no value, or one that is too large; the message says why, in one line."""
+    """Invalid or too large value; the message gives the reason in one line."""
 
 
 def pack(value: Any) -> bytes:
-    """Value as bytes.
+    """Serialize a value.
 
     Raises:
-        ValueRefused: it has something else than numbers, texts, bytes, lists, maps and arrays.
+        ValueRefused: the value contains other types than numbers, text, bytes, lists, maps and
+            arrays, or is nested too deeply.
     """
     try:
         packed: bytes = msgpack.packb(value, default=_described)
@@ -43,14 +44,14 @@ def pack(value: Any) -> bytes:
 def unpack(
     data: bytes, hook: Callable[[dict[Any, Any]], Any] | None = None, most: int = BYTES_MAX
 ) -> Any:
-    """Value of bytes; arrays are views of the bytes, and cannot be written.
+    """Deserialize a value; its arrays are read-only views of `data`.
 
     Args:
-        hook: called with each map that is no array, and returns what takes its place.
-        most: largest number of bytes.
+        hook: called with each map that is not an array; returns the value that replaces the map.
+        most: largest allowed size of `data` [B].
 
     Raises:
-        ValueRefused: the bytes are no value.
+        ValueRefused: `data` is too large or invalid, or `hook` refuses a map.
     """
     if len(data) > most:
         raise ValueRefused(f"got {len(data)} B, expected at most {most}")
@@ -67,7 +68,7 @@ def unpack(
     except ValueRefused:
         raise
     except (ValueError, TypeError, OverflowError, RecursionError, msgpack.UnpackException) as error:
-        raise ValueRefused(f"no msgpack with arrays: {error}") from None
+        raise ValueRefused(f"invalid msgpack: {error}") from None
 
 
 def _described(value: Any) -> Any:

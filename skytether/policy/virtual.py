@@ -1,12 +1,14 @@
-"""Both ends and the network between in virtual time: what is deployed, evaluated.
+"""Both ends over an emulated network in virtual time, to evaluate a policy before deployment.
 
-    with Emulated(policy, actions="absolute", step=0.02, to_policy="constant(50ms) & loss(5%)",
-                  to_robot="constant(50ms) & loss(5%)", thinking=0.086) as robot:
-        reply = robot.infer(observation)   # time passes until it is answered
-        robot.sleep(0.1)                   # the robot plays five rows
+    options = RobotOptions("absolute", deadline_ns=150_000_000, step_ns=20_000_000)
+    robot = Emulated(policy, options, to_policy="constant(50ms) & loss(5%)",
+                     to_robot="constant(50ms) & loss(5%)", thinking=0.086)
+    robot.connect()
+    reply = robot.infer(observation)   # advances the virtual time until the answer
+    robot.sleep(0.1)                   # the robot executes five rows
 
-The ends are `RobotEnd` and `PolicyEnd`, the network is netem's: with one seed, a run is the same
-each time, to the last bit.
+The ends are `RobotEnd` and `PolicyEnd`, as deployed; the network is emulated by `netem`. Runs with
+the same seed are equal bit for bit.
 """
 
 from collections.abc import Callable
@@ -19,7 +21,7 @@ from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import impairments
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
 from skytether.policy import values
-from skytether.policy.robot import LINE, RobotEnd, RobotOptions, Said
+from skytether.policy.robot import LINE, FrameType, RobotEnd, RobotOptions
 from skytether.policy.serving import PolicyEnd
 from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base.errors import ConfigError
@@ -36,26 +38,27 @@ CONNECTS_NS = 60 * SECOND_NS
 
 
 class NoActionError(RuntimeError):
-    """A call was answered with an error; the message says why."""
+    """A call was answered with an error; the message gives the reason."""
 
 
 class Emulated:
-    """A robot's program, with the policy at the far end of an emulated network.
+    """Robot program and policy at the two ends of an emulated network, in virtual time.
 
     Args:
-        policy: from an observation to the reply, a dict with an array `actions`; what it raises is
+        policy: from an observation to the reply, a dict with an array `actions`; an exception is
             an error of the policy.
-        options: the robot's end.
-        to_policy, to_robot: impairments of each direction (`skytether list impairments`).
-        thinking: time that the policy takes [s]; None: it never answers.
-        seed: seed of the network.
-        metadata: what the policy says when it is connected.
-        link, gate: of both ends, with keys or without.
-        compress, unpacker: see `images`.
+        options: options of the robot end.
+        to_policy, to_robot: network impairments of each direction (`skytether list impairments`).
+        thinking: computation time of the policy [s]; None: it never replies.
+        seed: random seed of the network.
+        metadata: metadata that the policy sends when it is connected.
+        link, gate: encryption at the robot end and at the policy end; None: plaintext.
+        compress, unpacker: compression of images, see `images`.
         gives_rows: see `PolicyEnd`.
+        boot_ids: run numbers of robot end and policy end.
 
     Raises:
-        ConfigError: an impairment is impossible.
+        ConfigError: an impairment is invalid.
     """
 
     def __init__(
@@ -95,55 +98,60 @@ class Emulated:
         )
         self.now_ns = 0
         self.answers: list[tuple[int, bytes]] = []
-        """Time of each message to the program [ns], and what it says, see `robot.Said`."""
+        """Time [ns] and content of each frame sent to the program, see `robot.FrameType`."""
         self.is_cut = False
-        """Whether nothing passes."""
+        """Whether the network is cut."""
         self._ways = [
             _way(to_policy, seed, "to_policy"),
             _way(to_robot, seed, "to_robot"),
         ]
         self._later: list[tuple[int, int, bytes, Address]] = []
-        """What the policy's line will hear: time [ns], order, what, and of which robot."""
+        """Pending frames of the policy: due time [ns], order, frame, connection."""
         self._order = count()
         self.on_datagram: Callable[[Datagram], None] = lambda _: None
-        """Called with each datagram as it leaves."""
+        """Called with each datagram when it is sent."""
 
     def connect(self) -> Any:
-        """Connect the program; returns the policy's metadata."""
-        self.say(Said.OPENED.value)
+        """Connect the program; returns the policy's metadata.
+
+        Raises:
+            NoActionError: no metadata has arrived within CONNECTS_NS.
+        """
+        self.say(FrameType.OPENED.value)
         self.run(self.now_ns + CONNECTS_NS, lambda: bool(self.answers))
         if not self.answers:
-            raise NoActionError("no policy has answered")
+            raise NoActionError("no metadata from the policy")
         return values.unpack(self.answers[-1][1][1:])
 
     def infer(self, observation: Any) -> Any:
-        """The policy's reply, from the present row on; time passes until it is there.
+        """Reply to an observation, from the present row on; advances the virtual time.
 
         Raises:
-            NoActionError: there is nothing to play.
+            NoActionError: the reply is an error.
         """
         before = len(self.answers)
-        self.say(Said.MESSAGE.value + values.pack(observation))
-        # Every call is answered: by its deadline, or with the first chunk.
+        self.say(FrameType.MESSAGE.value + values.pack(observation))
+        # Each call is answered: by its deadline, or the first one within `begin_ns`.
         self.run(self.now_ns + 3600 * SECOND_NS, lambda: len(self.answers) > before)
         said = self.answers[-1][1]
-        if said[:1] == Said.ERROR:
+        if said[:1] == FrameType.ERROR:
             raise NoActionError(said[1:].decode())
         return values.unpack(said[1:])
 
     def sleep(self, seconds: float) -> None:
+        """Advance the virtual time by `seconds` [s]."""
         self.run(self.now_ns + seconds_to_ns(seconds))
 
     def say(self, said: bytes, peer: Address = PROGRAM) -> None:
-        """Let the robot's line hear what a program says."""
+        """Deliver a frame of a program to the robot end."""
         self.robot.receive(Datagram(said, peer, LINE), now_ns=self.now_ns)
 
     def policy_says(self, said: bytes, peer: Address) -> None:
-        """Let the policy's line hear something."""
+        """Deliver a frame of the policy to the policy end."""
         self.server.receive(Datagram(said, peer, LINE), now_ns=self.now_ns)
 
     def run(self, until_ns: int, stop: Callable[[], bool] = lambda: False) -> None:
-        """Let time pass until then, or until `stop` is true."""
+        """Advance the virtual time to `until_ns`, or until `stop` returns true."""
         while True:
             self._collect(self.robot)
             self._collect(self.server)
@@ -188,13 +196,15 @@ class Emulated:
                     link.accept(Datagram(payload, peer, 0), lane, now_ns=self.now_ns)
 
     def _ask(self, payload: bytes, peer: Address) -> None:
-        if payload[:1] == Said.OPENED:
-            self._answer(Said.OPENED.value + self._metadata, peer, 0)
-        elif payload[:1] == Said.MESSAGE and self.thinking_ns is not None:
+        if payload[:1] == FrameType.OPENED:
+            self._answer(FrameType.OPENED.value + self._metadata, peer, 0)
+        elif payload[:1] == FrameType.MESSAGE and self.thinking_ns is not None:
             try:
-                said = Said.MESSAGE.value + values.pack(self._policy(values.unpack(payload[1:])))
+                said = FrameType.MESSAGE.value + values.pack(
+                    self._policy(values.unpack(payload[1:]))
+                )
             except Exception as error:
-                said = Said.ERROR.value + str(error).encode()
+                said = FrameType.ERROR.value + str(error).encode()
             self._answer(said, peer, self.thinking_ns)
 
     def _answer(self, said: bytes, peer: Address, after_ns: int) -> None:

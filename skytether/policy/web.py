@@ -1,8 +1,8 @@
-"""The lines of both ends to what people run: openpi's websocket protocol.
+"""Websocket connections to the robot program and to the policy server, with openpi's protocol.
 
-After the connection the server sends the policy's metadata; then each message of the client is an
-observation, and each of the server a reply in bytes, or an error as text. Compression is off at
-both ends, as openpi has it.
+When a client connects, the server sends the policy's metadata. Each later message of the client is
+an observation, and each later message of the server a binary reply, or an error as text. Websocket
+compression is off at client and server, as in openpi.
 """
 
 import asyncio
@@ -18,21 +18,21 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed, InvalidURI, WebSocketException
 from websockets.http11 import Request, Response
 
-from skytether.policy.robot import LINE, Said
+from skytether.policy.robot import LINE, FrameType
 from skytether.policy.values import MADE_BYTES_MAX
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.events.flight import address_text
 from skytether.shell.host.udp import AddressError, from_kernel, to_kernel
 
 ANSWERS_MAX = 16
-"""Number of answers that may wait until a program reads them; then its connection is closed."""
+"""Largest number of answers that a program has not read; then its connection is closed."""
 PROGRAM = "program"
 Hear = Callable[[Datagram], None]
 Messages = asyncio.Queue[bytes | str]
 
 
 class ProgramLine:
-    """Websocket server for the robot's program: the newest connection is the program's.
+    """Websocket server for the robot program; a new connection replaces the previous one.
 
     Raises:
         AddressError: the address cannot be bound.
@@ -57,14 +57,14 @@ class ProgramLine:
             return False
         connection, answers = self._connections[peer[1]]
         if answers.full():
-            self._close(connection, "the answers are not read")
+            self._close(connection, "the program does not read its answers")
             return False
         said = payload[1:]
-        answers.put_nowait(said.decode() if payload[:1] == Said.ERROR else said)
+        answers.put_nowait(said.decode() if payload[:1] == FrameType.ERROR else said)
         return True
 
     def _close(self, connection: ServerConnection, reason: str) -> None:
-        """Close a connection, without waiting for its program, which may be frozen."""
+        """Close a connection without waiting for its program, which may not respond."""
         task = asyncio.get_running_loop().create_task(connection.close(reason=reason))
         self._closing.add(task)
         task.add_done_callback(self._closing.discard)
@@ -86,25 +86,25 @@ class ProgramLine:
             self._close(each, "another program has connected")
         answers = Messages(ANSWERS_MAX)
         self._connections[number] = connection, answers
-        self._hear(Datagram(Said.OPENED.value, peer, LINE))
+        self._hear(Datagram(FrameType.OPENED.value, peer, LINE))
         writer = asyncio.get_running_loop().create_task(_write(connection, answers))
         try:
             with suppress(ConnectionClosed):
                 async for message in connection:
                     said = message.encode() if isinstance(message, str) else message
-                    self._hear(Datagram(Said.MESSAGE.value + said, peer, LINE))
+                    self._hear(Datagram(FrameType.MESSAGE.value + said, peer, LINE))
         finally:
             writer.cancel()
             del self._connections[number]
-            self._hear(Datagram(Said.CLOSED.value, peer, LINE))
+            self._hear(Datagram(FrameType.CLOSED.value, peer, LINE))
 
 
 class PolicyLine:
-    """Websocket clients of the policy's server, one for each robot.
+    """Websocket clients of the policy server, one for each robot.
 
     Args:
-        url: address of the policy's server, as in ws://127.0.0.1:8000.
-        api_key: key that is sent as openpi's client sends it; empty for none.
+        url: address of the policy server, as in ws://127.0.0.1:8000.
+        api_key: API key, sent in the header `Authorization` as by openpi's client; empty: none.
     """
 
     address = None
@@ -113,17 +113,17 @@ class PolicyLine:
         self._url, self._hear = url, hear
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
         self._waiting: dict[Address, Messages] = {}
-        """Observations for each connection, of which `PolicyEnd` sends one at a time."""
+        """Observations to be sent on each connection; at most one at a time."""
         self._tasks: dict[Address, asyncio.Task[None]] = {}
 
     def send(self, payload: bytes, peer: Address) -> bool:
         match payload[:1]:
-            case Said.OPENED:
+            case FrameType.OPENED:
                 self._waiting[peer] = Messages()
                 self._tasks[peer] = asyncio.get_running_loop().create_task(self._speak(peer))
-            case Said.CLOSED:
+            case FrameType.CLOSED:
                 self._end(peer)
-            case Said.MESSAGE if peer in self._waiting:
+            case FrameType.MESSAGE if peer in self._waiting:
                 self._waiting[peer].put_nowait(payload[1:])
         return True
 
@@ -147,29 +147,30 @@ class PolicyLine:
                 compression=None,
                 max_size=2 * MADE_BYTES_MAX,
                 additional_headers=self._headers,
-                ping_interval=None,  # openpi's server answers no ping while its policy thinks
+                # openpi's server does not answer pings while its policy computes.
+                ping_interval=None,
             ) as connection:
                 metadata = await connection.recv()
                 if isinstance(metadata, str):
-                    raise TypeError("it sends text where openpi sends its metadata")
-                self._hear(Datagram(Said.OPENED.value + metadata, peer, LINE))
+                    raise TypeError("got text from the policy server, expected its metadata")
+                self._hear(Datagram(FrameType.OPENED.value + metadata, peer, LINE))
                 writer = asyncio.get_running_loop().create_task(_write(connection, waiting))
                 try:
                     async for reply in connection:
                         if isinstance(reply, str):
-                            said = Said.ERROR.value + reply.encode()
+                            said = FrameType.ERROR.value + reply.encode()
                         else:
-                            said = Said.MESSAGE.value + reply
+                            said = FrameType.MESSAGE.value + reply
                         self._hear(Datagram(said, peer, LINE))
                 finally:
                     writer.cancel()
         except (OSError, WebSocketException, TypeError) as error:
             reason = str(error) or type(error).__name__
-        self._hear(Datagram(Said.CLOSED.value + reason.encode(), peer, LINE))
+        self._hear(Datagram(FrameType.CLOSED.value + reason.encode(), peer, LINE))
 
 
 def check_url(url: str) -> str:
-    """Reason why a policy's server cannot have this address; empty if it can."""
+    """Reason why an address of a policy server is invalid; empty if it is valid."""
     from websockets.uri import parse_uri
 
     try:
@@ -180,14 +181,14 @@ def check_url(url: str) -> str:
 
 
 async def _write(connection: Connection, messages: Messages) -> None:
-    """Send what is put into a queue, until the connection is closed."""
+    """Send the messages of a queue until the connection is closed."""
     with suppress(ConnectionClosed):
         while True:
             await connection.send(await messages.get())
 
 
 def _health(connection: ServerConnection, request: Request) -> Response | None:
-    """Answer to /healthz, which openpi's server has, too."""
+    """Response to /healthz, as by openpi's server."""
     if request.path == "/healthz":
         return connection.respond(http.HTTPStatus.OK, "OK\n")
     return None

@@ -1,4 +1,4 @@
-"""Both ends of a policy in virtual time: each call is answered by its deadline."""
+"""Robot end and policy end in virtual time: each call is answered by its deadline."""
 
 from contextlib import suppress
 from typing import Any
@@ -12,7 +12,7 @@ from policy_lab import MS, OPTIONS, Lab, first_row, keyed, ramp, secured, state
 from skytether.policy import values
 from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.players import Freshest, Queue
-from skytether.policy.robot import RobotOptions, Said
+from skytether.policy.robot import FrameType, RobotOptions
 from skytether.policy.virtual import ROBOT, SERVER, NoActionError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
@@ -55,7 +55,7 @@ def test_every_call_is_answered_by_its_deadline(
 
 
 def test_a_late_answer_is_cut_to_now_and_the_robot_goes_on_without_a_jump() -> None:
-    """250 ms there and back, and 100 ms of actions from each answer: rows go on one by one."""
+    """Round-trip time 250 ms, 100 ms of rows executed per answer: no row is skipped or repeated."""
     lab = Lab(ramp, to_policy="constant(125ms)", to_robot="constant(125ms)")
     lab.connect()
     position, played = 0.0, list[float]()
@@ -107,7 +107,7 @@ def test_a_chunk_from_before_an_outage_is_not_played_after_it() -> None:
         except RuntimeError:
             row = 0.0
         lab.sleep(0.1)
-    # Its observation was of the place where the robot stands, so its rows begin there.
+    # Its observation was made during the pause, so its first row is the next one.
     assert row in (0.0, 9.0) or row >= 50.0
 
 
@@ -121,7 +121,7 @@ def test_an_error_of_the_policy_leaves_the_rest_then_an_error() -> None:
     lab.connect()
     lab.infer(state(0.0))
     lab.sleep(0.1)
-    assert first_row(lab.infer(state(5.0))) == 5.0  # of the chunk before
+    assert first_row(lab.infer(state(5.0))) == 5.0  # of the earlier chunk
     assert any("CUDA out of memory" in str(event) for event in lab.robot.events())
 
 
@@ -238,18 +238,18 @@ def test_a_new_program_plays_nothing_of_the_one_before() -> None:
     lab.connect()
     lab.infer(state(100.0))
     lab.is_cut = True
-    lab.say(Said.CLOSED.value)
-    lab.say(Said.OPENED.value, ("program", 2))
-    lab.say(Said.MESSAGE.value + values.pack(state(0.0)), ("program", 2))
+    lab.say(FrameType.CLOSED.value)
+    lab.say(FrameType.OPENED.value, ("program", 2))
+    lab.say(FrameType.MESSAGE.value + values.pack(state(0.0)), ("program", 2))
     lab.run(lab.now_ns + 61 * SECOND_NS)
-    assert lab.answers[-1][1][:1] == Said.ERROR
+    assert lab.answers[-1][1][:1] == FrameType.ERROR
 
 
 def test_a_lost_connection_to_the_policy_is_opened_again() -> None:
     lab = Lab(ramp)
     lab.connect()
     lab.infer(state(0.0))
-    lab.policy_says(Said.CLOSED.value + b"gone", ("policy", 1))
+    lab.policy_says(FrameType.CLOSED.value + b"gone", ("policy", 1))
     lab.sleep(2)
     assert first_row(lab.infer(state(3.0))) == 3.0
 
@@ -289,7 +289,7 @@ def test_with_keys_nothing_is_readable_and_replays_change_nothing() -> None:
 
 def test_another_key_gets_no_session() -> None:
     lab = secured(keyed(2))
-    lab.say(Said.OPENED.value)
+    lab.say(FrameType.OPENED.value)
     lab.sleep(5)
     assert not lab.answers
     assert lab.server.figures()["robots"] == 0
@@ -305,7 +305,7 @@ def test_hostile_datagrams_change_nothing(payloads: list[bytes]) -> None:
         lab.server.receive(Datagram(payload, ROBOT, 0), now_ns=lab.now_ns)
         lab.server.receive(Datagram(payload, ("203.0.113.9", 9), 0), now_ns=lab.now_ns)
         lab.robot.receive(Datagram(payload, SERVER, 0), now_ns=lab.now_ns)
-        lab.say(Said.MESSAGE.value + payload)
+        lab.say(FrameType.MESSAGE.value + payload)
     lab.run(lab.now_ns)
     lab.sleep(0.2)
     assert first_row(lab.infer(state(2.0))) == 2.0

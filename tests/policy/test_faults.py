@@ -1,4 +1,4 @@
-"""Faults, and what the robot got each time; docs/policy.md has the table."""
+"""Answers to the robot program under faults, as in the table of docs/policy.md."""
 
 from dataclasses import replace
 from typing import Any
@@ -23,7 +23,7 @@ from skytether.policy import metrics, values
 from skytether.policy.exchange import Exchange
 from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
-from skytether.policy.robot import RobotEnd, RobotOptions, Said
+from skytether.policy.robot import FrameType, RobotEnd, RobotOptions
 from skytether.policy.serving import PolicyEnd
 from skytether.policy.virtual import ROBOT, SERVER, NoActionError
 from skytether.server.gate import PlainGate
@@ -36,8 +36,9 @@ FAR = {"to_policy": "constant(20ms)", "to_robot": "constant(20ms)"}
 
 
 def fly(lab: Lab, calls: int, position: float = 0.0) -> tuple[list[float | None], float]:
-    """First rows of the answers to a program that plays five rows of each, None for an error, and
-    where it is then; each is answered by its deadline.
+    """Make calls, execute five rows of each answer, and check that each meets its deadline.
+
+    Returns: first row of each answer, None for an error; and the final position.
     """
     got = list[float | None]()
     for _ in range(calls):
@@ -72,7 +73,7 @@ def shares(lab: Lab) -> dict[str, int]:
 
 @KEYS
 def test_a_policys_end_that_was_killed_and_restarted(made: Any) -> None:
-    """Rows left, then hold, then errors, until the robot has found the new one after 3 to 4 s."""
+    """Remaining rows, hold action, errors; after 3 to 4 s chunks of the new process."""
     lab, position = flying(made)
     gate = PlainGate() if made is Lab else secured_gate()
     lab.server = PolicyEnd(gate, boot_id=77, draw=lambda: 99)
@@ -86,7 +87,7 @@ def test_a_policys_end_that_was_killed_and_restarted(made: Any) -> None:
 
 @pytest.mark.parametrize(("made", "after_s"), [(Lab, 5), (secured, 2)], ids=["plain", "keys"])
 def test_a_robots_end_that_was_killed_and_restarted(made: Any, after_s: float) -> None:
-    """Its program connects anew, and waits for its first answer. Without keys the robot's number
+    """The program reconnects and waits for its first answer. Without keys the robot's number
     belongs to the old address until it has been silent for 3 s.
     """
     lab, _ = flying(made)
@@ -101,7 +102,7 @@ def test_a_robots_end_that_was_killed_and_restarted(made: Any, after_s: float) -
     moved.leaves = lambda each: each.peer != ROBOT
     lab.server = moved  # type: ignore[assignment]
     began_ns, before = lab.now_ns, len(lab.answers)
-    lab.say(Said.OPENED.value)
+    lab.say(FrameType.OPENED.value)
     lab.run(lab.now_ns + 60 * SECOND_NS, lambda: len(lab.answers) > before)
     assert first_row(lab.infer(state(7.0))) == 7.0
     assert lab.now_ns - began_ns < after_s * SECOND_NS
@@ -109,7 +110,7 @@ def test_a_robots_end_that_was_killed_and_restarted(made: Any, after_s: float) -
 
 @pytest.mark.parametrize(("made", "after_s"), [(Lab, 5), (secured, 0)], ids=["plain", "keys"])
 def test_an_address_that_changes(made: Any, after_s: float) -> None:
-    """With keys nothing is lost; without, the robot says hello again after 3 s of silence."""
+    """With keys no answer is lost; without, the robot sends HELLO after 3 s without a datagram."""
     lab, position = flying(made)
     moved = Around(lab.server)
     moved.seen_as = lambda each: each if each.socket else each._replace(peer=("198.51.100.7", 9))
@@ -125,11 +126,11 @@ def test_an_address_that_changes(made: Any, after_s: float) -> None:
 
 @pytest.mark.parametrize("frozen", ["robot", "server"])
 def test_a_process_that_was_frozen(frozen: str) -> None:
-    """No row from before is played: the program gets hold or an error, then fresh chunks."""
+    """No earlier row is executed: the hold action or an error, then new chunks."""
     lab, position = flying()
     end = Around(getattr(lab, frozen))
     setattr(lab, frozen, end)
-    lab.say(Said.MESSAGE.value + values.pack(state(position)))
+    lab.say(FrameType.MESSAGE.value + values.pack(state(position)))
     before, end.until_ns = len(lab.answers), lab.now_ns + 5 * SECOND_NS
     lab.run(end.until_ns, lambda: len(lab.answers) > before)
     lab.run(end.until_ns + SECOND_NS)
@@ -141,12 +142,12 @@ def test_a_process_that_was_frozen(frozen: str) -> None:
 
 
 def test_a_hello_of_an_earlier_run_ends_no_session() -> None:
-    """It was recorded when its run did not use the answer, so that the gate does not know it."""
+    """Replay of a HELLO whose run never had a session, so that the gate cannot recognize it."""
     lab, position = flying(secured)
     link = SecureLink(keyed(), entropy=np.random.default_rng(9).bytes)
     earlier = RobotEnd(1, {0: SERVER}, link, OPTIONS, boot_id=55)
     earlier.wake(now_ns=lab.now_ns)
-    for _ in range(2):  # the answer to the first is a cookie
+    for _ in range(2):  # the first is answered with a cookie
         for each in earlier.outbox():
             lab.server.receive(Datagram(each.payload, ("203.0.113.9", 9)), now_ns=lab.now_ns)
         for each in lab.server.outbox():
@@ -157,11 +158,11 @@ def test_a_hello_of_an_earlier_run_ends_no_session() -> None:
     assert got == [20.0, 25.0, 30.0]
 
 
-# -- the policy --------------------------------------------------------------------------------
+# -- policy -------------------------------------------------------------------------------------
 
 
 def test_a_policy_that_hangs() -> None:
-    """Rows left, hold, errors; after its patience the server connects anew, and all is well."""
+    """Remaining rows, hold action, errors; new chunks after a reconnection after `patience_ns`."""
     lab, position = flying()
     lab.thinking_ns = None
     got, _ = fly(lab, 110, position)
@@ -173,7 +174,7 @@ def test_a_policy_that_hangs() -> None:
 
 
 def test_a_policy_that_takes_as_long_as_many_calls() -> None:
-    """1.5 s for 4 s of rows, and a call each 20 ms: rows go on one by one."""
+    """Chunks of 4 s computed in 1.5 s, a call each 20 ms: no row is skipped or repeated."""
 
     def policy(seen: Any) -> Any:
         return {"actions": seen["state"][0] + np.arange(200.0)[:, None]}
@@ -190,7 +191,7 @@ def test_a_policy_that_takes_as_long_as_many_calls() -> None:
 
 def test_an_answer_that_comes_after_its_connection_was_given_up_is_nobodys() -> None:
     lab, position = flying()
-    lab.thinking_ns = 31_120 * MS  # 100 ms after it is connected anew
+    lab.thinking_ns = 31_120 * MS  # 100 ms after the reconnection
     lab.infer(state(-900.0))
     lab.thinking_ns = 500 * MS
     got, _ = fly(lab, 150, position)
@@ -200,9 +201,9 @@ def test_an_answer_that_comes_after_its_connection_was_given_up_is_nobodys() -> 
 
 
 def test_a_policy_that_answers_twice_is_connected_anew() -> None:
-    """Else each observation would get the answer to the one before."""
+    """Otherwise each observation would get the reply to the previous one."""
     lab, position = flying()
-    lab.policy_says(Said.MESSAGE.value + values.pack(ramp(state(-900.0))), ("policy", 1))
+    lab.policy_says(FrameType.MESSAGE.value + values.pack(ramp(state(-900.0))), ("policy", 1))
     got, position = fly(lab, 12, position)
     assert all(each is None or each >= 20.0 for each in got)
     assert first_row(lab.infer(state(position))) == position
@@ -226,7 +227,7 @@ def test_metadata_that_never_comes_is_asked_for_anew() -> None:
     lab = Lab(ramp)
     asked = lab._ask
     lab._ask = lambda *_: None  # type: ignore[method-assign]
-    lab.say(Said.OPENED.value)
+    lab.say(FrameType.OPENED.value)
     lab.sleep(20)
     lab._ask = asked  # type: ignore[method-assign]
     lab.sleep(15)
@@ -235,7 +236,7 @@ def test_metadata_that_never_comes_is_asked_for_anew() -> None:
 
 
 def test_rows_of_another_shape_are_not_played() -> None:
-    """Rows left of the chunk before, then hold, then an error; the log says why."""
+    """Remaining rows of earlier chunks, hold action, error; the log gives the reason."""
     lab = Lab(lambda seen: {"actions": np.zeros((10, 2 if seen["state"][0] < 20 else 3))}, **FAR)
     lab.connect()
     lab.infer(state(0.0))
@@ -244,18 +245,18 @@ def test_rows_of_another_shape_are_not_played() -> None:
     lab.sleep(2)
     with pytest.raises(NoActionError):
         lab.infer(state(20.0))
-    assert any("got rows of (3,), expected (2,)" in str(each) for each in lab.robot.events())
+    assert any("got row shape (3,), expected (2,)" in str(each) for each in lab.robot.events())
 
 
 @pytest.mark.parametrize("depth", [100, 600, 2000])
 def test_a_reply_that_is_nested_deep_is_an_error_at_most(depth: int) -> None:
     lab = Lab(ramp, replace(OPTIONS, begin_ns=SECOND_NS), thinking=None)
     lab.connect()
-    lab.say(Said.MESSAGE.value + values.pack(state(0.0)))
+    lab.say(FrameType.MESSAGE.value + values.pack(state(0.0)))
     lab.sleep(0.1)
     actions = values.pack("actions") + values.pack(np.zeros((3, 1)))
     nested = values.pack("nested") + b"\x81\xa1a" * depth + b"\xc0"
-    lab.policy_says(Said.MESSAGE.value + b"\x82" + actions + nested, ("policy", 1))
+    lab.policy_says(FrameType.MESSAGE.value + b"\x82" + actions + nested, ("policy", 1))
     lab.sleep(2)
     assert len(lab.answers) == 2
 
@@ -264,7 +265,7 @@ def test_a_reply_that_is_nested_deep_is_an_error_at_most(depth: int) -> None:
 
 
 def test_a_camera_that_stops() -> None:
-    """Its image is missing from the observation; the policy decides, and the rest goes on."""
+    """Observations without its image reach the policy, and are answered."""
     lab = Lab(ramp, compress=Compressor(64), unpacker=Unpacker, **FAR)
     lab.connect()
     image = np.zeros((240, 320, 3), np.uint8)
@@ -275,7 +276,7 @@ def test_a_camera_that_stops() -> None:
 
 
 def test_observations_of_20_mb() -> None:
-    """Images of any size are resized first; what is still too large is an error that says so."""
+    """Large images are resized and sent; a large array is refused with its size."""
     lab = Lab(ramp, compress=Compressor(224), unpacker=Unpacker, **FAR)
     lab.connect()
     image = np.zeros((1700, 1960, 3), np.uint8)
@@ -291,9 +292,9 @@ def test_an_observation_that_is_nested_deep_is_an_error_at_once() -> None:
     lab = Lab(ramp, compress=Compressor(32), unpacker=Unpacker)
     lab.connect()
     lab.infer(state(0.0))
-    lab.say(Said.MESSAGE.value + b"\x81\xa1a" * 900 + b"\xc0")
+    lab.say(FrameType.MESSAGE.value + b"\x81\xa1a" * 900 + b"\xc0")
     lab.run(lab.now_ns)
-    assert lab.answers[-1][1].startswith(Said.ERROR.value + b"the observation is refused")
+    assert lab.answers[-1][1].startswith(FrameType.ERROR.value + b"the observation is refused")
 
 
 # -- programs ----------------------------------------------------------------------------------
@@ -303,7 +304,7 @@ def test_a_program_that_does_not_wait_for_its_answers_gets_each_in_order() -> No
     lab, position = flying()
     before = len(lab.answers)
     for _ in range(5):
-        lab.say(Said.MESSAGE.value + values.pack(state(position)))
+        lab.say(FrameType.MESSAGE.value + values.pack(state(position)))
     lab.sleep(0.2)
     assert len(lab.answers) == before + 5
 
@@ -311,16 +312,16 @@ def test_a_program_that_does_not_wait_for_its_answers_gets_each_in_order() -> No
 def test_of_two_programs_the_newest_is_the_robots() -> None:
     lab, _ = flying()
     other = ("program", 2)
-    lab.say(Said.OPENED.value, other)
-    lab.say(Said.MESSAGE.value + values.pack(state(0.0)))  # of the first: not heard
+    lab.say(FrameType.OPENED.value, other)
+    lab.say(FrameType.MESSAGE.value + values.pack(state(0.0)))  # of the first program: ignored
     before = len(lab.answers)
     lab.sleep(1)
-    assert len(lab.answers) == before + 1  # the metadata for the second
-    lab.say(Said.MESSAGE.value + values.pack(state(300.0)), other)
+    assert len(lab.answers) == before + 1  # metadata for the second program
+    lab.say(FrameType.MESSAGE.value + values.pack(state(300.0)), other)
     lab.sleep(0.2)
     assert first_row(values.unpack(lab.answers[-1][1][1:])) == 300.0
-    lab.say(Said.CLOSED.value)  # the first has gone: nothing changes
-    lab.say(Said.MESSAGE.value + values.pack(state(310.0)), other)
+    lab.say(FrameType.CLOSED.value)  # the first program disconnects: no effect
+    lab.say(FrameType.MESSAGE.value + values.pack(state(310.0)), other)
     lab.sleep(0.2)
     assert first_row(values.unpack(lab.answers[-1][1][1:])) == 310.0
 
@@ -333,12 +334,12 @@ def test_a_program_that_pauses_plays_nothing_old_and_its_pause_is_no_step() -> N
     assert lab.robot.figures()["step_s"] <= 1.0
 
 
-# -- the network -------------------------------------------------------------------------------
+# -- network -----------------------------------------------------------------------------------
 
 
 @KEYS
 def test_ten_thousand_hostile_datagrams(made: Any) -> None:
-    """From strangers, and in the name of each end's address: nothing changes."""
+    """From foreign addresses and from the address of each end: they have no effect."""
     lab, position = flying(made)
     rng = np.random.default_rng(6)
     recorded = [payload for _, payload in lab.wire]
@@ -346,7 +347,7 @@ def test_ten_thousand_hostile_datagrams(made: Any) -> None:
         payload = bytearray(recorded[count % len(recorded)])
         for at in rng.integers(len(payload), size=3):
             payload[at] = rng.integers(256)
-        if made is Lab:  # without keys whoever knows the session may write in it
+        if made is Lab:  # without keys anybody who knows the session number can send in it
             payload[3:8] = b"\xce" + rng.bytes(4)
         lab.server.receive(Datagram(bytes(payload), ("203.0.113.9", 9)), now_ns=lab.now_ns)
         lab.robot.receive(Datagram(bytes(payload), SERVER), now_ns=lab.now_ns)
@@ -356,14 +357,14 @@ def test_ten_thousand_hostile_datagrams(made: Any) -> None:
 
 
 def test_clocks_that_differ_and_jump() -> None:
-    """Only round trips and own steps count, whatever the other end's clock says."""
+    """Clock offsets do not matter: only round-trip times and own control steps are used."""
     lab, position = flying(options=OPTIONS)
     server = Around(lab.server)
     lab.server = server  # type: ignore[assignment]
     rate = lab.robot.figures()["link"]["rate_bytes_per_s"]
     for hours in (3, 900, 901):
         server.shift_ns = hours * 3600 * SECOND_NS
-        # A clock that jumps by more than 10 s is silence for a server: the session begins anew.
+        # A clock step of more than SILENCE_NS ends the session; a new one begins.
         lab.sleep(6)
         got, position = fly(lab, 20, position)
         assert None not in got[1:]
@@ -403,7 +404,7 @@ def test_of_several_paths_one_is_dead() -> None:
 
 
 def test_a_deadline_below_the_networks_jitter() -> None:
-    """Each call is answered by then, and rows go on one by one while there are any."""
+    """Each call is answered by its deadline; no row is skipped or repeated while rows remain."""
     way = "gamma(60ms, 90ms, 30ms)"
     options = RobotOptions("absolute", 20 * MS, step_ns=20 * MS, rows=5)
     lab = Lab(ramp, options, to_policy=way, to_robot=way)
@@ -432,7 +433,7 @@ def test_needed_observations_in_an_outage() -> None:
 
 
 def test_under_a_low_rate_metadata_arrives_and_calls_go_on() -> None:
-    """A metadata message that takes longer than the robot's next question is sent on, not again."""
+    """Metadata that take longer than a keep-alive interval are sent once, not restarted."""
     end = Exchange(1, rate_max=12_500.0)
     end.send(METADATA, bytes(50_000))
     streams = list[int]()
@@ -444,7 +445,7 @@ def test_under_a_low_rate_metadata_arrives_and_calls_go_on() -> None:
     assert streams[-1] == OBSERVATION
 
 
-# -- what is counted ---------------------------------------------------------------------------
+# -- figures -----------------------------------------------------------------------------------
 
 
 def test_every_figure_is_a_metric() -> None:

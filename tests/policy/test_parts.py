@@ -1,4 +1,4 @@
-"""`policy.parts`, `policy.exchange` and `policy.pace`: messages as datagrams, and back."""
+"""`policy.parts`, `policy.exchange`, `policy.pace`: parts, reassembly, send rate and loss."""
 
 from random import Random
 
@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from skytether.policy import parts
 from skytether.policy.exchange import Exchange
-from skytether.policy.messages import OBSERVATION, PartMessage, Seen, decode, encode
+from skytether.policy.messages import OBSERVATION, PartMessage, Report, decode, encode
 from skytether.policy.parts import HELD_MAX, Part, Reassembly
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -100,7 +100,7 @@ def test_parts_that_disagree_are_refused() -> None:
 
 
 def test_parity_follows_the_loss() -> None:
-    """The figures of a Reed-Solomon code with 18 parts, by the binomial distribution."""
+    """Values for a Reed-Solomon code with 18 data parts, from the binomial distribution."""
     assert [parts.parity_for(18, loss) for loss in (0.0, 0.01, 0.05, 0.1)] == [0, 2, 4, 7]
 
 
@@ -117,13 +117,13 @@ def test_every_datagram_is_below_the_limit() -> None:
     ends = Exchange(2**32 - 1), Exchange(2**32 - 1)
     ends[0].send(OBSERVATION, bytes(100_000))
     sent = pump(ends, lambda _: True, 5 * SECOND_NS)
-    assert max(map(len, sent)) <= PAYLOAD_BYTES_MAX - 32  # of which a channel's seal takes 32 B
+    assert max(map(len, sent)) <= PAYLOAD_BYTES_MAX - 32  # encryption adds 32 B
 
 
 def pump(
     ends: tuple[Exchange, Exchange], passes: object, until_ns: int, delay_ns: int = 20 * MS
 ) -> list[bytes]:
-    """Let two ends exchange what they have; returns the datagrams."""
+    """Exchange datagrams between two ends until `until_ns`; returns the datagrams sent."""
     now_ns, sent = 0, []
     under_way: list[tuple[int, int, bytes]] = []
     while now_ns < until_ns:
@@ -142,7 +142,7 @@ def pump(
             message, end = decode(each[2]), ends[each[1]]
             if isinstance(message, PartMessage):
                 end.accept(message, now_ns=now_ns)
-            elif isinstance(message, Seen):
+            elif isinstance(message, Report):
                 end.learn(message, now_ns=now_ns)
     return sent
 
@@ -167,7 +167,7 @@ def test_a_message_that_has_begun_is_sent_to_its_end_and_of_those_that_wait_the_
     for size in (30_000, 20, 10):
         end.send(OBSERVATION, bytes(size))
     first = end.outbox(now_ns=0)
-    assert 0 < len(first) < 10  # the rest waits for the rate
+    assert 0 < len(first) < 10  # the send rate delays the others
     assert end.dropped == 1
     later = first + [
         each for at in range(0, 3 * SECOND_NS, 10 * MS) for each in end.outbox(now_ns=at)
@@ -177,7 +177,7 @@ def test_a_message_that_has_begun_is_sent_to_its_end_and_of_those_that_wait_the_
 
 
 def test_under_a_low_rate_observations_go_on_and_no_loss_is_measured() -> None:
-    """A message takes longer than until the next one: each is whole, and the newest follows."""
+    """Sending takes longer than the message period: each message sent arrives complete."""
     ends, now_ns, whole = (Exchange(1, rate_max=12_500.0), Exchange(1)), 0, 0
     for now_ns in range(0, 20 * SECOND_NS, 10 * MS):
         if now_ns % (100 * MS) == 0:
@@ -186,7 +186,7 @@ def test_under_a_low_rate_observations_go_on_and_no_loss_is_measured() -> None:
             for message in map(decode, end.outbox(now_ns=now_ns)):
                 if isinstance(message, PartMessage):
                     whole += other.accept(message, now_ns=now_ns + 50 * MS) is not None
-                elif isinstance(message, Seen):
+                elif isinstance(message, Report):
                     other.learn(message, now_ns=now_ns + 100 * MS)
     assert whole >= 24
     assert ends[0].pace.loss < 0.01

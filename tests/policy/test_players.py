@@ -1,4 +1,4 @@
-"""`policy.players`: the row that a robot plays at each step."""
+"""`policy.players`: the row to execute at each control step."""
 
 from copy import copy
 
@@ -27,7 +27,7 @@ def test_the_row_of_the_present_step_is_played_whenever_the_chunk_arrives() -> N
 
 
 def test_an_older_generation_fills_the_steps_for_which_the_newest_has_no_row() -> None:
-    """A chunk that was overtaken changes nothing but what the newer one leaves open."""
+    """A chunk that arrives out of order adds rows only for steps without a newer row."""
     player = Clocked()
     player.accept(held(3, 2, 32.0), 0)
     player.accept(held(2, 0, 20.0, 21.0, 22.0, 23.0), 0)
@@ -69,7 +69,7 @@ def test_the_newest_action_is_held_and_an_overtaken_one_is_ignored() -> None:
 
 
 def test_a_queue_counts_the_rows_that_it_has_played_and_stands_still_when_empty() -> None:
-    """So after a stall its rows are played too late, by the length of the stall."""
+    """After a pause its rows are executed late, by the length of the pause."""
     player = Queue()
     player.accept(held(1, 0, 0.0, 1.0), 0)
     assert played(player, range(4)) == [0.0, 1.0, None, None]

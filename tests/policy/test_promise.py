@@ -1,5 +1,5 @@
-"""The promise, searched for counterexamples: each call is answered by its deadline, no row is left
-out or played twice while there is no gap, and nothing old is played after one.
+"""Property-based search for a call without one answer by its deadline, and for skipped or repeated
+rows, or rows executed too late.
 """
 
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from policy_lab import MS, Around, Lab, ramp, secured, secured_gate, state
 from skytether.policy import values
 from skytether.policy.players import Clocked, Freshest, Queue
-from skytether.policy.robot import RobotOptions, Said
+from skytether.policy.robot import FrameType, RobotOptions
 from skytether.policy.serving import PolicyEnd
 from skytether.server.gate import PlainGate
 from skytether.shared.base.units import SECOND_NS
@@ -21,25 +21,25 @@ from skytether.shared.base.units import SECOND_NS
 ROWS, PLAYED, STEP_NS = 10, 5, 20 * MS
 OPTIONS = RobotOptions("delta", 150 * MS, hold_ns=SECOND_NS, step_ns=STEP_NS, rows=PLAYED)
 LATE_NS = OPTIONS.hold_ns + OPTIONS.deadline_ns + ROWS * 8 * MS
-"""Longest time after that for which it was planned at which a row is played [ns]."""
+"""Longest allowed time from the planned to the actual execution of a row [ns]."""
 
 
 @dataclass(frozen=True)
 class Move:
-    """What happens until the next call."""
+    """Events between two calls."""
 
     jitter_ms: int = 0
-    """Time by which the program takes longer than its rows [ms]."""
+    """Time by which the program calls later than after its rows [ms]."""
     is_cut: bool = False
-    """Whether nothing passes the network until the next move."""
+    """Whether the network is cut until the next move."""
     frozen_ms: int = 0
-    """Time for which the robot's end does nothing, from the middle of the rows on [ms]."""
+    """Time for which the robot end is frozen, from the middle of the executed rows on [ms]."""
     frozen_call_ms: int = 0
-    """The same from the call on."""
+    """Time for which the robot end is frozen, from the call on [ms]."""
 
 
 def tagged(observation: Any) -> dict[str, Any]:
-    """Rows that say from which call they are, and for which step of the robot."""
+    """Policy whose rows are (call number, control step)."""
     call, step = (float(each) for each in observation["state"])
     return {"actions": np.array([[call, step + row] for row in range(ROWS)])}
 
@@ -93,14 +93,16 @@ def test_the_promise(
         lab.run(max(lab.now_ns, robot.until_ns))
         began_ns = lab.now_ns
         asked[call] = began_ns, step
-        lab.say(Said.MESSAGE.value + values.pack({"state": np.array([float(call), float(step)])}))
+        lab.say(
+            FrameType.MESSAGE.value + values.pack({"state": np.array([float(call), float(step)])})
+        )
         robot.until_ns = lab.now_ns + move.frozen_call_ms * MS
         wait_for(lab, call + 1)
         answered_ns, said = lab.answers[-1]
         limit_ns = options.deadline_ns if call > 1 else options.begin_ns
         assert answered_ns - began_ns <= max(limit_ns, move.frozen_call_ms * MS)
         rows: list[list[float]] = []
-        if said[:1] == Said.MESSAGE:
+        if said[:1] == FrameType.MESSAGE:
             reply = values.unpack(said[1:])["actions"]
             assert reply.shape == (ROWS, 2)
             rows = [row for row in reply.tolist() if row[0]]
@@ -144,20 +146,20 @@ def test_whatever_happens_each_call_gets_one_answer_by_its_deadline(
     options = replace(options, spare_rows=spare, player=player, begin_ns=2 * SECOND_NS)
     lab = made(options=options, to_policy=way, to_robot=way, seed=seed)
     world, program = World(lab, seed), ("program", 1)
-    lab.say(Said.OPENED.value, program)
+    lab.say(FrameType.OPENED.value, program)
     lab.sleep(2)
     for number, (what, wait_ms) in enumerate(does, start=2):
         if what == "reconnect":
             program = "program", number
-            lab.say(Said.OPENED.value, program)
+            lab.say(FrameType.OPENED.value, program)
         calls = {"call": 1, "calls": 2}.get(what, 0)
         if not calls:
             world.do(what)
         before, began_ns = len(lab.answers), lab.now_ns
         for _ in range(calls):
-            lab.say(Said.MESSAGE.value + values.pack(state(float(number))), program)
+            lab.say(FrameType.MESSAGE.value + values.pack(state(float(number))), program)
         assert lab.robot._program
-        # While the robot's end is frozen, it may still hear that its program is a new one.
+        # A frozen robot end may not have seen yet that a new program has connected.
         is_first = lab.robot._program.newest < 0 or lab.now_ns < world.until_ns
         longest_ns = options.begin_ns if is_first else options.deadline_ns
         limit_ns = max(began_ns, world.until_ns) + longest_ns + 1
@@ -172,7 +174,7 @@ def is_metadata(said: bytes) -> bool:
 
 
 class World:
-    """What happens around a robot's end."""
+    """Policy, network and processes around a robot end, with faults."""
 
     def __init__(self, lab: Lab, seed: int) -> None:
         self._lab, self._rng = lab, np.random.default_rng(seed)
@@ -199,12 +201,12 @@ class World:
                 setattr(lab, name, end)
                 self.until_ns = lab.robot.until_ns if name == "robot" else self.until_ns
             case "raises":
-                lab.policy_says(Said.ERROR.value + b"no memory", connection)
+                lab.policy_says(FrameType.ERROR.value + b"no memory", connection)
             case "hangs" | "thinks":
                 lab.thinking_ns = None if what == "hangs" else int(self._rng.integers(2000)) * MS
             case "closes":
-                lab.policy_says(Said.CLOSED.value, connection)
+                lab.policy_says(FrameType.CLOSED.value, connection)
             case "twice":
-                lab.policy_says(Said.MESSAGE.value + values.pack(ramp(state(0.0))), connection)
+                lab.policy_says(FrameType.MESSAGE.value + values.pack(ramp(state(0.0))), connection)
             case "nonsense":
-                lab.policy_says(Said.MESSAGE.value + self._rng.bytes(30), connection)
+                lab.policy_says(FrameType.MESSAGE.value + self._rng.bytes(30), connection)

@@ -1,4 +1,4 @@
-"""A policy over real UDP: openpi's own client unchanged, both commands, and both ends in Python."""
+"""Over real UDP: openpi's unchanged client with both commands, and the Python interface."""
 
 import asyncio
 import json
@@ -29,7 +29,7 @@ from skytether.shared.telemetry.parts import parse
 
 
 class PolicyServer:
-    """Server with openpi's protocol: metadata first, then a reply for each observation."""
+    """Policy server with openpi's protocol: metadata, then a reply to each observation."""
 
     def __init__(self) -> None:
         self.thinking_s = 0.0
@@ -75,7 +75,7 @@ def policy() -> Iterator[PolicyServer]:
 
 @contextmanager
 def process(*line: str) -> Iterator[str]:
-    """A process; the address that it says it is listening on."""
+    """Run a process; its listening address, from its log."""
     with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as running:
         try:
             assert running.stdout
@@ -104,7 +104,7 @@ def joined(server: str, *flags: str) -> AbstractContextManager[str]:
 
 
 def calls(client: WebsocketClientPolicy, count: int, period_s: float = 0.1) -> Sequence[float]:
-    """Rows of the calls of a program that plays five rows of each answer."""
+    """Make calls, execute five rows of each answer; returns the executed rows."""
     position, rows = 0.0, list[float]()
     for _ in range(count):
         reply = client.infer({"state": np.array([position]), "prompt": "go on"})
@@ -118,7 +118,7 @@ def calls(client: WebsocketClientPolicy, count: int, period_s: float = 0.1) -> S
 def test_openpis_own_client_flies_through_both_commands(
     policy: PolicyServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """With keys, a bad network between, and a policy that answers with an error at the end."""
+    """With keys, an impaired network, and an error of the policy at the end."""
     keys = ["--keys", str(tmp_path / "keys")]
     assert main(["keygen", keys[1]]) == 0
     capsys.readouterr()

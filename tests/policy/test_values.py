@@ -1,4 +1,4 @@
-"""`policy.values` and `policy.images`: openpi's bytes, bounds, and images on their way."""
+"""`policy.values` and `policy.images`: openpi's serialization, size limits, image compression."""
 
 import io
 from contextlib import suppress

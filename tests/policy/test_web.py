@@ -1,4 +1,4 @@
-"""`policy.web` over this machine's TCP: programs and servers that do not do what openpi's do."""
+"""`policy.web` over local TCP: programs and policy servers that behave unlike openpi's."""
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
@@ -9,7 +9,7 @@ from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from skytether.policy.robot import Said
+from skytether.policy.robot import FrameType
 from skytether.policy.web import ANSWERS_MAX, PolicyLine, ProgramLine
 from skytether.shared.endpoints.endpoint import Address, Datagram
 
@@ -36,17 +36,17 @@ def test_a_new_program_is_heard_although_the_one_before_does_not_answer() -> Non
     async def run() -> None:
         heard = Heard()
         async with program_line(heard) as (line, url), connect(url) as first:
-            assert await heard.next() == (Said.OPENED.value, ("program", 1))
-            first.transport.pause_reading()  # it never answers that it is to close
+            assert await heard.next() == (FrameType.OPENED.value, ("program", 1))
+            first.transport.pause_reading()  # it never answers the close frame
             async with connect(url) as second:
-                assert await heard.next() == (Said.OPENED.value, ("program", 2))
+                assert await heard.next() == (FrameType.OPENED.value, ("program", 2))
                 await second.send(b"call")
-                assert await heard.next() == (Said.MESSAGE.value + b"call", ("program", 2))
+                assert await heard.next() == (FrameType.MESSAGE.value + b"call", ("program", 2))
                 await second.send("text")
-                assert await heard.next() == (Said.MESSAGE.value + b"text", ("program", 2))
-                assert line.send(Said.MESSAGE.value + b"reply", ("program", 2))
+                assert await heard.next() == (FrameType.MESSAGE.value + b"text", ("program", 2))
+                assert line.send(FrameType.MESSAGE.value + b"reply", ("program", 2))
                 assert await second.recv() == b"reply"
-                assert line.send(Said.ERROR.value + b"failed", ("program", 2))
+                assert line.send(FrameType.ERROR.value + b"failed", ("program", 2))
                 assert await second.recv() == "failed"
             first.transport.abort()
 
@@ -59,13 +59,13 @@ def test_a_program_that_reads_no_answer_is_closed() -> None:
         async with program_line(heard) as (line, url), connect(url, max_queue=1) as program:
             _, peer = await heard.next()
             program.transport.pause_reading()
-            answer, sent = Said.MESSAGE.value + bytes(4_000_000), 0
+            answer, sent = FrameType.MESSAGE.value + bytes(4_000_000), 0
             while line.send(answer, peer):
                 sent += 1
                 await asyncio.sleep(0)
             assert sent <= ANSWERS_MAX + 8
             program.transport.abort()
-            assert await heard.next() == (Said.CLOSED.value, peer)
+            assert await heard.next() == (FrameType.CLOSED.value, peer)
         assert not line.send(answer, peer)
 
     asyncio.run(run())
@@ -74,19 +74,19 @@ def test_a_program_that_reads_no_answer_is_closed() -> None:
 def upstream(
     handle: Callable[[ServerConnection], Awaitable[None]], asks: Callable[[PolicyLine], None]
 ) -> list[bytes]:
-    """What a line hears of a policy's server, until its connection is closed."""
+    """Frames that `PolicyLine` receives from a policy server until the connection is closed."""
 
     async def run() -> list[bytes]:
         heard = Heard()
         async with serve(handle, "127.0.0.1", 0) as server:
             port = next(iter(server.sockets)).getsockname()[1]
             line = PolicyLine(f"ws://127.0.0.1:{port}", "", heard.put_nowait)
-            line.send(Said.OPENED.value, PEER)
+            line.send(FrameType.OPENED.value, PEER)
             said = [(await heard.next())[0]]
             asks(line)
-            while not said[-1].startswith(Said.CLOSED.value):
+            while not said[-1].startswith(FrameType.CLOSED.value):
                 said.append((await heard.next())[0])
-            line.send(Said.CLOSED.value, PEER)
+            line.send(FrameType.CLOSED.value, PEER)
             assert not line._tasks
             assert not line._waiting
         return said
@@ -99,8 +99,8 @@ def test_a_server_that_goes_while_it_is_not_asked_is_noticed_at_once() -> None:
         await connection.send(b"metadata")
 
     opened, closed = upstream(handle, lambda _: None)
-    assert opened == Said.OPENED.value + b"metadata"
-    assert closed[:1] == Said.CLOSED.value
+    assert opened == FrameType.OPENED.value + b"metadata"
+    assert closed[:1] == FrameType.CLOSED.value
 
 
 def test_answers_that_nobody_asked_for_are_heard_as_they_come() -> None:
@@ -110,7 +110,9 @@ def test_answers_that_nobody_asked_for_are_heard_as_they_come() -> None:
         for answer in (b"one", b"two", "Traceback"):
             await connection.send(answer)
 
-    said = upstream(handle, lambda line: line.send(Said.MESSAGE.value + b"call", PEER) and None)
+    said = upstream(
+        handle, lambda line: line.send(FrameType.MESSAGE.value + b"call", PEER) and None
+    )
     assert said[1:4] == [b"mone", b"mtwo", b"eTraceback"]
 
 
