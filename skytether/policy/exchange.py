@@ -22,7 +22,7 @@ time between two datagrams at the smallest send rate."""
 REMEMBERED_MAX = 64
 """Number of newest sent messages whose reports are evaluated, and of reports that may wait."""
 PART_HEAD_BYTES = 40
-"""Header and encryption of a datagram with a part [B]."""
+"""Size of header and encryption of a datagram with a part [B]."""
 
 
 @dataclass(slots=True)

@@ -35,7 +35,7 @@ Hear = Callable[[Datagram], None]
 
 
 class PolicyError(RuntimeError):
-    """No row remained for longer than `hold`, or no metadata, or the observation was refused."""
+    """Error as the answer to a call; the message gives the reason."""
 
 
 def link_of(keys: Path | str | None, robot: int) -> ClientLink:

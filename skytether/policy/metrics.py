@@ -36,7 +36,7 @@ calls policy_calls_total
 answers/{kind} policy_answers_total
     Answers by kind: chunk of this call, remaining rows, hold action, or error.
 late_s_max policy_late_answer_seconds_max
-    Longest time from a deadline to its answer.
+    Longest time by which an answer exceeded its deadline.
 observations_refused policy_refused_observations_total
     Observations that were too large or invalid.
 delay_s policy_delay_seconds

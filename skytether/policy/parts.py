@@ -68,7 +68,7 @@ def split(message: bytes, stream: int, number: int, parity: Callable[[int], int]
     """Parts of a message, in the order in which they are sent.
 
     Args:
-        parity: from the number of data parts of a block to its number of parity parts.
+        parity: function from the number of data parts of a block to its number of parity parts.
     """
     size, blocks = len(message), blocks_of(len(message))
     count, length = block_parts(size, blocks)

@@ -103,14 +103,14 @@ class RobotOptions:
     """Key of the actions in the policy's reply."""
     step_ns: int | None = None
     """Length of a control step [ns]; None: measured as the time from an answer to the next call,
-    divided by `rows`. Required with `plays_on`, where that time is no multiple of the step."""
+    divided by `rows`. Required with `plays_on`, where that time does not measure the step."""
     rows: int = 1
     """Number of rows that the program executes of each answer."""
     plays_on: bool = False
     """Whether the robot continues to execute rows during a call."""
     spare_rows: int | None = None
-    """An observation is sent only if fewer rows will remain when its chunk arrives; None: each is
-    sent."""
+    """An observation is sent only if fewer rows than this number will remain when its chunk arrives;
+    None: each is sent."""
     rate_max: float = RATE_MAX
     """Largest send rate [B/s]."""
     player: Callable[[], Player] = Clocked
@@ -208,7 +208,7 @@ class RobotEnd(Endpoint):
         self._drops = Counter[str]()
         self._refused = 0
         self._late_ns = 0
-        """Longest time from a deadline to its answer [ns]."""
+        """Longest time by which an answer exceeded its deadline [ns]."""
         self._is_holding = False
         self._age_ns, self._left = -1, 0
         """At the last answer: age of the newest chunk's observation [ns], -1: no chunk; and number

@@ -73,7 +73,7 @@ class Schedule:
         self.step_ns, self._at_ns = step_ns, began_ns
         self._count = 0.0
         self._end = 0
-        """First step without a row."""
+        """First step without a row in the received chunks."""
         self._given = 0
         """First step without a row in the program's last answer; later chunks do not change it."""
         self._reply: Any = None
@@ -163,12 +163,10 @@ class Schedule:
                     f"{self._key}: got row shape {rows.shape[1:]}, expected {before} as before"
                 )
         if self._reply is None:
-            stood_ns = (
-                self.stood_ns
-            )  # first chunk: the robot has not moved yet, so it is never late
+            stood_ns = self.stood_ns  # the robot has not moved yet: the first chunk is never late
         elif self._is_late(stood_ns):
             late_s = (self.stood_ns - stood_ns) / SECOND_NS
-            why = f"the robot has paused for {late_s:.1f} s since its observation"
+            why = f"the robot has paused for {late_s:.1f} s since the chunk's observation"
             raise ValueRefused(f"{why}, expected at most the sum of deadline and hold")
         self._made[call] = stood_ns
         self._player.accept(Held(call, first, rows), step)

@@ -65,7 +65,7 @@ class _Robot:
     paths: "OrderedDict[tuple[int, Address], int]" = field(default_factory=OrderedDict)
     """Time of the newest datagram [ns] of each socket and address, newest last."""
     waiting: _Job | None = None
-    """Newest observation that the policy has not got yet."""
+    """Newest observation that waits for the policy."""
     thinking: _Job | None = None
     """Observation for which the policy computes a chunk."""
     answered: tuple[int, bytes] = (-1, b"")
