@@ -109,7 +109,7 @@ class RobotOptions:
     plays_on: bool = False
     """Whether the robot continues to execute rows during a call."""
     spare_rows: int | None = None
-    """An observation is sent only if fewer rows than this number will remain when its chunk arrives;
+    """An observation is sent only if fewer rows than this will remain when its chunk arrives;
     None: each is sent."""
     rate_max: float = RATE_MAX
     """Largest send rate [B/s]."""
