@@ -34,8 +34,8 @@ class Impairment:
     """
 
     kind: Literal["delay", "loss", "other"] = "other"
-    """Kind of effect. Adding an impairment of another kind does not change the random numbers of
-    delays and losses."""
+    """Kind of effect. The first delay and the first loss keep their random numbers when others are
+    added."""
     least_s: float = 0.0
     """Smallest delay that the impairment adds [s]."""
     mean_s: float = 0.0

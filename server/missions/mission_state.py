@@ -61,10 +61,9 @@ class VehicleRows(NamedTuple):
     repeats_for: I1
     """Steps after `sent_step` for which the motion is repeated, see `VehicleMotions.repeats`."""
     early: F1
-    """Largest number of steps by which the vehicle is ahead of its counted step, see `StepError`.
-    """
+    """Largest number of steps that the vehicle may be ahead of `now + ahead`, see `StepError`."""
     late: F1
-    """Largest number of steps by which the vehicle is behind its counted step."""
+    """Largest number of steps that the vehicle may be behind `now + ahead`."""
 
     @classmethod
     def of(cls, capacity: int) -> Self:
@@ -132,8 +131,8 @@ class MissionState:
         self._all = np.arange(capacity)
         self.observed_step: Indices = self.rows.observed_step
         self.due, self._moved_by = np.zeros((2, block), dtype=np.int64)
-        """Scratch of `align`: PLAN_DUE and REPEAT_DUE of each vehicle, and the change of its offset
-        on the grid."""
+        """Output of `align` for each vehicle: PLAN_DUE and REPEAT_DUE as bits, and the change of
+        `rows.ahead` [steps]."""
         scale = np.ones(terms.axes)
         scale[ALTITUDE:] = scenario.section(MissionConfig).height_scale
         self.possible = PossibleMotions(scale, terms.dt_s)

@@ -23,7 +23,7 @@ HEAD = b"\xa3\x95"
 FMT, FMT_BYTES = 128, 89
 FIX_3D = 3
 HOME = 1
-"""Type of a message ORGN whose place is home."""
+"""Type of ORGN messages that give home."""
 CODES = {
     **{code: code for code in "bBhHiIqQfd"},
     "c": "h",

@@ -51,8 +51,8 @@ class Model(NamedTuple):
     b1: Array
 
     def axes(self) -> list[Axis]:
-        # numpy takes twice as long for sums of two or three numbers, the longest in the vehicle's
-        # loops.
+        # The sums in the vehicle's loops have at most three terms: numpy takes twice as long as
+        # floats.
         columns = [field.tolist() for field in self]
         return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
 

@@ -158,7 +158,7 @@ class Zones:
         return least * np.where(self._inside(points), self._sign, -self._sign)
 
     def _with_height(self, signed: Array, height: Array) -> Array:
-        """Clearances with three axes, from those in the plane and altitudes; shape (n, zones)."""
+        """Clearances in space [m], from plane clearances and altitudes; shape (n, zones)."""
         off = np.maximum(self._low - height, height - self._high)
         apart = np.where(off > 0.0, np.hypot(off, np.maximum(signed, 0.0)), np.maximum(signed, off))
         # Within a fence: distance from the nearest of its sides, floor and ceiling.

@@ -35,7 +35,7 @@ class ExplainOptions:
     """A scenario's name (`skytether list scenarios`), a .toml file, or a recording (.mcap) of a
     flight in virtual time or over UDP."""
     at: Annotated[float | None, Argument(metavar="T")] = None
-    """Time of flight of the moment to explain [s]; by default the gravest moment."""
+    """Flight time at the moment to explain [s]; default: the most severe one."""
     vehicle: Annotated[int | None, Argument(metavar="N")] = None
     """Number of the vehicle whose moment is to be explained; by default any."""
     seeds: Annotated[int, Argument(metavar="N")] = 0

@@ -139,8 +139,8 @@ def is_averted(moment: Moment, outcome: CaseOutcome) -> bool:
 
 
 def error_m(moment: Moment, outcome: CaseOutcome) -> float:
-    """Largest error of the moment's vehicle during and shortly after it [m]; of all vehicles if the
-    moment has vehicle 0.
+    """Largest error during the moment and shortly after it [m]: of its vehicle, or of all if that
+    is 0.
     """
     errors = [
         track.error_m[_within(track.time_s, moment.start_s - AROUND_S, moment.end_s + AFTER_S)]

@@ -68,7 +68,7 @@ CALL_COLUMNS = np.dtype(
         ("time_ns", "<i8"),  # time of the answer
         ("robot", "<i8"),
         ("call", "<i8"),  # number of the call
-        ("kind", "u1"),  # 0 fresh, 1 rest, 2 hold, 3 error
+        ("kind", "u1"),  # 0 fresh, 1 remaining rows, 2 hold, 3 error
         ("waited_ns", "<i8"),  # time from the call to the answer
         ("chunk_age_ns", "<i8"),  # age of the newest chunk's observation, -1: no chunk yet
         ("left", "<i8"),  # rows of the answer computed by the policy

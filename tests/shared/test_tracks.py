@@ -285,7 +285,7 @@ def test_the_origin_of_the_scenario_counts_more_than_the_plans() -> None:
         (plan({"TransectStyleComplexItem": {"Items": 5}}), "expected a simple item"),
         (plan(item(20), version=1), "a mission of version 2, got 1"),
         (plan(item(20)).replace(b"{", b'{"version":2,', 1), "a plan of version 1, got 2"),
-        (plan(item(20), vehicleType=1), "vehicleType: expected that of a vehicle that can stop"),
+        (plan(item(20), vehicleType=1), "vehicleType: expected a vehicle that can stop"),
         (plan(item(20), vehicleType=[2]), "got MAV_TYPE [2]"),
         (plan(item(20), scan([])), "mission item 2: expected a survey with the places"),
         (plan(scan([item(206)] * 2), scan(None)), "mission item 3: expected a survey with the pla"),
