@@ -16,6 +16,7 @@ from skytether.explain.causes import Cause
 from skytether.explain.flying import CaseOutcome, FlyAll
 from skytether.explain.moments import Moment, comes_about, error_m
 from skytether.explain.units import is_possible
+from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 from skytether.shared.telemetry.summary import WORSE
@@ -156,7 +157,8 @@ def _listed(units: Sequence[Unit], scenario: Scenario) -> Iterator[tuple[str, Ke
     if any("model" in name for name in names):
         yield "the model identified", _identified(scenario)
     stalled = {each.process for each in units if isinstance(each, Stall)}
-    if "server" in stalled:
+    can_stand_by = 3 * (link.fixed_ns or 0) <= seconds_to_ns(link.timeout_s)  # `client.several`
+    if "server" in stalled and can_stand_by:
         yield STANDBY, Keys()
     if stalled:
         yield _key("link.timeout_s", 2.0 * link.timeout_s)

@@ -26,7 +26,7 @@ from skytether.shell.commandline.command import CONFIGURATION, CommandError
 from skytether.shell.commandline.options import read
 from skytether.shell.driving.driver import Shell, run
 from skytether.shell.host.paths import NetworkPath
-from skytether.shell.host.udp import AddressError
+from skytether.shell.host.udp import AddressError, is_loopback
 from skytether.shell.processes.log import Log, LogFormat
 from skytether.shell.processes.metrics import Metric
 from skytether.shell.processes.process import recorded, serving
@@ -210,6 +210,10 @@ def join(argv: Sequence[str]) -> None:
     ):
         if not least <= value <= most:
             raise _wrong(flag, value, f"{least} to {most}")
+    listen_at = command.address("--listen", options.listen)
+    if not (is_loopback(listen_at) or options.insecure):
+        expected = "an address of this machine alone, such as 127.0.0.1:8000, or --insecure"
+        raise _wrong("--listen", options.listen, expected)
     for option in ("json", "record"):
         command.claim_output(f"--{option}", getattr(options, option))
     link = inside.link_of(options.keys, options.robot)
@@ -231,7 +235,7 @@ def join(argv: Sequence[str]) -> None:
             compress=compress,
             recorder=recorder,
         )
-        listen = partial(web.ProgramLine, command.address("--listen", options.listen))
+        listen = partial(web.ProgramLine, listen_at)
         shell = _shell(
             end, None, paths=numbered, is_patient=True, line=lambda hear, _: listen(hear)
         )

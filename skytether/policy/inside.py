@@ -7,7 +7,6 @@ import threading
 import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
@@ -117,7 +116,7 @@ class _FunctionLine:
             if observation is None:
                 continue
             try:
-                reply = self._infer(values.unpack(observation))
+                reply = self._infer(values.unpack(observation, most=values.MADE_BYTES_MAX))
                 if isinstance(reply, np.ndarray):
                     reply = {"actions": reply}
                 said = FrameType.MESSAGE.value + values.pack(reply)
@@ -230,6 +229,17 @@ class Robot:
     ) -> None:
         if actions not in ("absolute", "delta"):
             raise ConfigError(f"actions: got {actions!r}, expected 'absolute' or 'delta'")
+        for name, value, least, most in (
+            ("deadline", deadline, 1e-3, 3600.0),
+            ("step", 1.0 if step is None else step, 1e-3, 3600.0),
+            ("hold", hold, 0.0, 3600.0),
+            ("rows", rows, 1, 1024),
+            ("robot", robot, 0, 65_535),
+            ("quality", quality, 1, 100),
+            ("resize", 32 if resize is None else resize, 32, 4096),
+        ):
+            if not least <= value <= most:
+                raise ConfigError(f"{name}: got {value}, expected {least:g} to {most:g}")
         at, link = _address("server", server), link_of(keys, robot)
         _check_sealed("server", at, secure=link.secure or insecure)
         options = RobotOptions(
@@ -245,6 +255,7 @@ class Robot:
         self._line: _CallLine | None = None
         self._on_event = on_event
         self._shell = Shell(self._end, None, [at], line=self._open)
+        self._is_connected, self._unread = False, 0
         self._patience_s = max(deadline, options.begin_ns / SECOND_NS) + 5.0
 
     def _open(self, hear: Hear, _: object) -> _CallLine:
@@ -277,9 +288,12 @@ class Robot:
         assert self._line
         self._loop.call_soon_threadsafe(self._line.hear, Datagram(said, PEER, LINE))
 
-    def _answer(self, patience_s: float) -> bytes:
+    def _answer(self) -> bytes:
         assert self._line
-        return self._line.answers.get(timeout=patience_s)
+        try:
+            return self._line.answers.get(timeout=self._patience_s)
+        except queue.Empty:
+            raise PolicyError("no answer from the robot's end of the link") from None
 
     def infer(self, observation: Any) -> Any:
         """Reply to an observation, from the present row on.
@@ -291,13 +305,14 @@ class Robot:
             ValueRefused: the observation has a value of an unsupported type, see `values.pack`.
         """
         content = values.pack(observation)
-        if self.metadata is None:
-            with suppress(queue.Empty):
-                self.metadata = values.unpack(self._answer(self._patience_s)[1:])
-        if self.metadata is None:
-            raise PolicyError("no metadata from the policy server")
+        if not self._is_connected:
+            self.metadata = values.unpack(self._answer()[1:])
+            self._is_connected = True
         self._say(FrameType.MESSAGE.value + content)
-        answer = self._answer(self._patience_s)
+        self._unread += 1
+        while self._unread:  # more than one if an earlier call was interrupted
+            answer = self._answer()
+            self._unread -= 1
         if answer[:1] == FrameType.ERROR:
             raise PolicyError(answer[1:].decode())
         return values.unpack(answer[1:])

@@ -274,12 +274,12 @@ class RobotEnd(Endpoint):
 
     def _learn_metadata(self, message: bytes) -> None:
         try:
-            self._wants_rows, metadata = values.unpack(message)
+            wants_rows, metadata = values.unpack(message)
         except (ValueRefused, TypeError, ValueError):
             raise ProtocolError(Drop.FIELD) from None
         if not isinstance(metadata, bytes):
             raise ProtocolError(Drop.FIELD)
-        self._metadata = metadata
+        self._wants_rows, self._metadata = wants_rows is True, metadata
         self._greet()
 
     def _post(self, payload: bytes) -> None:
@@ -403,7 +403,7 @@ class RobotEnd(Endpoint):
         """Accept a chunk or an error of the policy."""
         try:
             call_number, reply, error = values.unpack(message)
-            if type(call_number) is not int:
+            if type(call_number) is not int or type(error) is not str:
                 raise ProtocolError(Drop.FIELD)
             content = None if error else values.unpack(reply)
         except (ValueRefused, TypeError, ValueError):
@@ -413,14 +413,18 @@ class RobotEnd(Endpoint):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         call = self._call
         if error:
-            self._events.append(events.PolicyFailed(robot=self._robot, reason=str(error)[:200]))
+            self._events.append(events.PolicyFailed(robot=self._robot, reason=error[:200]))
+            return
+        if program.newest < 0 and (call is None or call_number < call.number):
+            why = "its call was answered with an error, and the robot may have been moved since"
+            self._events.append(events.ChunkRefused(robot=self._robot, reason=why))
             return
         schedule, delay_ns = program.schedule, now_ns - asked.began_ns
         self._waits = delay_ns <= self._options.deadline_ns
         try:
             stood_ns = asked.stood_ns
             schedule.accept(call_number, asked.first, stood_ns, content, now_ns=now_ns)
-        except ValueRefused as refused:
+        except ValueError as refused:
             self._events.append(events.ChunkRefused(robot=self._robot, reason=str(refused)))
             return
         self._delays_ns.append(delay_ns)
@@ -444,7 +448,7 @@ class RobotEnd(Endpoint):
             try:
                 kind, reply, left = schedule.answer(kind, now_ns=now_ns)
                 message = values.pack(reply)
-            except (ValueRefused, RecursionError) as refused:  # nested too deeply
+            except Exception as refused:  # such as one nested too deeply; the call is answered
                 error = f"the policy's reply cannot be sent: {refused}"
         if kind is Kind.HOLD and not error:
             if reply is None or now_ns - since_ns > self._options.hold_ns:

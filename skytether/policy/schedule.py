@@ -77,6 +77,8 @@ class Schedule:
         self._given = 0
         """First step without a row in the program's last answer; later chunks do not change it."""
         self._reply: Any = None
+        self._last: Row | None = None
+        """Last row that the program was given to execute."""
         self._newest = -1
         """Number of the call that `_reply` answers."""
         self._first = 0
@@ -176,7 +178,7 @@ class Schedule:
 
     def left(self, *, now_ns: int) -> int:
         """Number of remaining rows."""
-        return self._end - self.advance(now_ns=now_ns)
+        return max(0, self._end - self.advance(now_ns=now_ns))
 
     def coming(self, count: int, *, now_ns: int) -> NDArray[Any] | None:
         """Next rows to execute, at most `count`; shape (n, *row), None if no row remains."""
@@ -202,8 +204,10 @@ class Schedule:
         made = rows_of(self._reply, self._key)
         rows, last = self._coming(step, len(made))
         if rows:
-            self._given, self.since_ns = step + min(len(rows), self._rows or len(rows)), None
+            given, last = min(len(rows), self._rows or len(rows)), rows[-1]
+            self._given, self.since_ns, self._last = step + given, None, rows[given - 1]
         else:
+            last = last if self._last is None else self._last
             kind = Kind.HOLD
             self.since_ns = now_ns if self.since_ns is None else self.since_ns
         if last is None:
@@ -223,7 +227,7 @@ def rows_of(reply: Any, key: str) -> NDArray[Any]:
         ValueRefused: the reply has no rows or more than ROWS_MAX, or a number is not finite.
     """
     rows = reply.get(key) if isinstance(reply, dict) else None
-    if not isinstance(rows, np.ndarray) or rows.ndim < 1 or not 0 < len(rows) <= ROWS_MAX:
+    if not isinstance(rows, np.ndarray) or not rows.ndim or not rows.size or len(rows) > ROWS_MAX:
         shape = getattr(rows, "shape", None)
         what = f"an array of shape {shape}" if shape is not None else type(rows).__name__
         raise ValueRefused(f"{key}: got {what}, expected an array with 1 to {ROWS_MAX} rows")

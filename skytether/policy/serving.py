@@ -11,6 +11,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from skytether.policy import events, values
 from skytether.policy.exchange import Exchange
 from skytether.policy.messages import (
@@ -139,7 +141,7 @@ class PolicyEnd(Endpoint):
     # -- datagrams -----------------------------------------------------------------------------
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        if datagram.socket == LINE:
+        if datagram.socket == LINE and datagram.peer[0] == POLICY:
             self._hear_policy(datagram.payload, datagram.peer[1], now_ns)
         else:
             try:
@@ -328,6 +330,8 @@ class PolicyEnd(Endpoint):
             if self._gives_rows and isinstance(observation, dict):
                 observation["delay_steps"] = delay
                 if coming is not None:
+                    if not isinstance(coming, np.ndarray) or not coming.ndim:
+                        raise ProtocolError(Drop.FIELD)
                     observation |= {"coming": coming, "committed": coming[:delay]}
             content = values.pack(observation)
         except (ValueRefused, TypeError, ValueError):

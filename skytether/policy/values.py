@@ -20,7 +20,7 @@ BYTES_MAX = 4_000_000
 MADE_BYTES_MAX = 64_000_000
 """Largest serialized value before compression, and largest sum of its decompressed images [B]."""
 AXES_MAX = 8
-_DTYPE = re.compile(r"[<>|=]?[biuf][1248]|[<>|=]?f16")
+_DTYPE = re.compile(r"[<>|=]?[biuf][1248]")
 
 
 class ValueRefused(ValueError):
@@ -72,7 +72,7 @@ def unpack(
 
 
 def _described(value: Any) -> Any:
-    if isinstance(value, np.ndarray | np.generic) and value.dtype.kind not in "biuf":
+    if isinstance(value, np.ndarray | np.generic) and not _DTYPE.fullmatch(value.dtype.str):
         raise ValueRefused(f"got an array of {value.dtype}, expected numbers")
     if isinstance(value, np.ndarray):
         return {

@@ -201,7 +201,7 @@ class Emulated:
         elif payload[:1] == FrameType.MESSAGE and self.thinking_ns is not None:
             try:
                 said = FrameType.MESSAGE.value + values.pack(
-                    self._policy(values.unpack(payload[1:]))
+                    self._policy(values.unpack(payload[1:], most=values.MADE_BYTES_MAX))
                 )
             except Exception as error:
                 said = FrameType.ERROR.value + str(error).encode()

@@ -188,7 +188,11 @@ async def _write(connection: Connection, messages: Messages) -> None:
 
 
 def _health(connection: ServerConnection, request: Request) -> Response | None:
-    """Response to /healthz, as by openpi's server."""
+    """Response to /healthz, as by openpi's server. Pages of a browser, which name their origin,
+    must not take the place of the robot program.
+    """
+    if "Origin" in request.headers:
+        return connection.respond(http.HTTPStatus.FORBIDDEN, "not for browsers\n")
     if request.path == "/healthz":
         return connection.respond(http.HTTPStatus.OK, "OK\n")
     return None

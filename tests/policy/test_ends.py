@@ -11,11 +11,13 @@ from hypothesis import strategies as st
 from policy_lab import MS, OPTIONS, Lab, first_row, keyed, ramp, secured, state
 from skytether.policy import values
 from skytether.policy.images import Compressor, Unpacker
-from skytether.policy.players import Freshest, Queue
-from skytether.policy.robot import FrameType, RobotOptions
+from skytether.policy.players import Clocked, Freshest, Queue
+from skytether.policy.robot import LINE, FrameType, RobotOptions
+from skytether.policy.schedule import Kind, Schedule
 from skytether.policy.virtual import ROBOT, SERVER, NoActionError
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.wire.drop import ProtocolError
 
 
 def test_without_a_network_the_answer_is_the_policys_own() -> None:
@@ -321,3 +323,78 @@ def test_without_keys_a_second_robot_with_the_same_number_is_refused() -> None:
     answer = lab.server.outbox()[-1]
     other.receive(Datagram(answer.payload, SERVER, 0), now_ns=lab.now_ns)
     assert "taken" in str(other.events()[-1])
+
+
+# -- what a review found -----------------------------------------------------------------------
+
+
+def test_what_comes_over_udp_is_never_taken_for_the_policy() -> None:
+    lab = Lab()
+    lab.connect()
+    lab.infer(state(0.0))
+    for said in (b"+", b"m" + values.pack(ramp(state(66.0))), b"-"):
+        lab.server.receive(Datagram(said, ("203.0.113.9", 1), LINE), now_ns=lab.now_ns)
+    lab.sleep(0.1)
+    assert first_row(lab.infer(state(5.0))) == 5.0
+    assert not any("66" in str(event) for event in lab.server.events())
+
+
+def test_a_first_chunk_is_not_executed_after_its_call_was_answered_with_an_error() -> None:
+    options = RobotOptions("absolute", 150 * MS, begin_ns=SECOND_NS, step_ns=20 * MS)
+    lab = Lab(options=options, thinking=1.5)
+    lab.connect()
+    with pytest.raises(NoActionError):
+        lab.infer(state(1.0))
+    lab.thinking_ns = 0
+    assert first_row(lab.infer(state(50.0))) == 50.0  # the robot was moved meanwhile
+
+
+def test_the_hold_action_is_the_last_row_that_was_executed() -> None:
+    schedule = Schedule(Clocked(), "absolute", "actions", 20 * MS, None, SECOND_NS, 0)
+    first = {"actions": np.arange(6.0)[:, None]}
+    schedule.accept(1, 0, 0.0, first, now_ns=0)
+    assert schedule.answer(Kind.FRESH, now_ns=0).left == 6
+    schedule.accept(2, 1, 0.0, {"actions": np.array([[100.0], [101.0]])}, now_ns=200 * MS)
+    answer = schedule.answer(Kind.REST, now_ns=200 * MS)
+    assert answer.kind is Kind.HOLD
+    assert answer.reply["actions"][0, 0] == 5.0
+
+
+@pytest.mark.parametrize("coming", [np.array(1.0), "rows", [1, 2], 3])
+def test_rows_that_a_robot_cannot_have_are_refused(coming: Any) -> None:
+    lab = Lab(gives_rows=True)
+    lab.connect()
+    lab.infer(state(0.0))
+    robot = lab.server._robots[1]
+    message = values.pack([9, 1, 1, coming, values.pack(state(3.0))])
+    with pytest.raises(ProtocolError):
+        lab.server._observe(robot, message, lab.now_ns)
+
+
+@pytest.mark.parametrize(
+    "chunk",
+    [
+        [1, b"", [[[[[]]]]]],
+        [1, values.pack({"actions": 1}), 3],
+        [1, b"", None],
+        ["1", b"", ""],
+    ],
+)
+def test_a_chunk_with_other_fields_is_refused(chunk: Any) -> None:
+    lab = Lab()
+    lab.connect()
+    with pytest.raises(ProtocolError):
+        lab.robot._accept(values.pack(chunk), lab.now_ns)
+
+
+def test_an_array_without_numbers_but_with_a_huge_shape_is_no_chunk() -> None:
+    lab = Lab(lambda _: {"actions": np.zeros((1, 2**40, 0), np.uint8)})
+    lab.connect()
+    lab.say(FrameType.MESSAGE.value + values.pack(state(0.0)))
+    lab.sleep(1.0)
+    assert len(lab.answers) == 1  # the metadata alone, and no exception
+
+
+def test_a_number_that_is_infinite_as_a_double_is_refused() -> None:
+    with pytest.raises(values.ValueRefused):
+        values.pack(np.array([1.0], np.longdouble))

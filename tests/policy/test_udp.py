@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 from urllib.request import urlopen
 
@@ -20,12 +21,13 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from helpers import SKYTETHER, refused
+from helpers import LOOPBACK, SKYTETHER, Idle, refused
 from policy_lab import ramp
 from skytether.__main__ import main
-from skytether.policy import PolicyError, Robot
+from skytether.policy import PolicyError, Robot, values
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.telemetry.parts import parse
+from skytether.shell.driving.driver import Shell
 
 
 class PolicyServer:
@@ -190,6 +192,7 @@ def test_a_robot_in_python_with_a_policy_in_python(tmp_path: Path) -> None:
         (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "90kbit"], "100kbit"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--when", "never"], "needed(2)"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rows", "0"], "1 to 1024"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--listen", "0.0.0.0:1"], "--insecure"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--plays-on"], "--step"),
         (["serve", "--upstream", "http://127.0.0.1"], "ws://HOST:PORT"),
         (["serve", "--bind", "0.0.0.0:1"], "--keys"),
@@ -206,3 +209,33 @@ def test_other_machines_need_keys_in_python_too() -> None:
         Robot("192.0.2.1:47010", actions="delta")
     with pytest.raises(ConfigError, match="absolute"):
         Robot("127.0.0.1:47010", actions="up")  # type: ignore[arg-type]
+
+
+def test_bound_sockets_leave_the_number_of_the_line_free() -> None:
+    opened = SimpleNamespace(address=None)
+    shell = Shell(Idle(), [LOOPBACK, LOOPBACK], line=lambda hear, _: opened)  # noqa: ARG005
+    assert sorted(shell.addresses) == [0, 2]
+    shell._close_sockets()
+
+
+def test_an_answer_to_a_call_that_was_interrupted_is_not_that_of_the_next() -> None:
+    robot = Robot("127.0.0.1:9", actions="delta")
+    said: list[bytes] = []
+    robot._say = said.append  # type: ignore[method-assign]
+    robot._is_connected, robot._unread, robot._patience_s = True, 1, 0.01
+    assert robot._line
+    for number in (1, 2):
+        robot._line.answers.put(b"m" + values.pack({"actions": np.array([float(number)])}))
+    assert robot.infer({})["actions"][0] == 2.0
+    with pytest.raises(PolicyError):
+        robot.infer({})
+    robot._shell._close_sockets()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"rows": 0}, {"robot": 70_000}, {"deadline": 0.0}, {"step": -1.0}, {"hold": -1.0}]
+)
+def test_a_robot_with_impossible_arguments_is_refused(wrong: dict[str, Any]) -> None:
+    (name,) = wrong
+    with pytest.raises(ConfigError, match=name):
+        Robot("127.0.0.1:9", actions="delta", **wrong)

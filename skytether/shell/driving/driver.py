@@ -174,7 +174,8 @@ class Shell:
         excused = (AddressError,) if len(paths) > 1 else ()
         with contextlib.ExitStack() as failed:
             failed.callback(self._close_sockets)
-            for number, each in enumerate(bound):
+            for place, each in enumerate(bound):
+                number = place + (place > 0 and line is not None)  # socket 1 is the line
                 sock = each if isinstance(each, socket) else open_socket(each)
                 self._put(number, sock)
                 if forms:
