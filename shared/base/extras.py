@@ -20,8 +20,11 @@ class ExtraMissing(ModuleNotFoundError):
 
 
 @contextmanager
-def named() -> Iterator[None]:
+def named(expected: str = "") -> Iterator[None]:
     """Within this block, an error for a missing module names the smallest extra that provides it.
+
+    Args:
+        expected: extra to name instead, where several provide a module.
 
     Raises:
         ExtraMissing: instead of a ModuleNotFoundError, if an extra provides the module.
@@ -38,7 +41,7 @@ def named() -> Iterator[None]:
         if isinstance(error, ExtraMissing) or not having:
             raise
         smallest = min(having, key=lambda extra: len(extras[extra]))
-        raise ExtraMissing(module, smallest) from None
+        raise ExtraMissing(module, expected or smallest) from None
 
 
 def need(extra: str) -> None:

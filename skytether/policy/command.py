@@ -235,7 +235,7 @@ def join(argv: Sequence[str]) -> None:
             compress=compress,
             recorder=recorder,
         )
-        listen = partial(web.ProgramLine, listen_at)
+        listen = partial(web.ProgramServer, listen_at)
         shell = _shell(
             end, None, paths=numbered, is_patient=True, line=lambda hear, _: listen(hear)
         )

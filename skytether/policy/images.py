@@ -10,9 +10,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
 
 from skytether.policy.values import MADE_BYTES_MAX, ValueRefused
+from skytether.shared.base import extras
+
+with extras.named("policy"):
+    from PIL import Image, ImageOps
 
 SIDE_MIN, SIDE_MAX = 32, 4096
 JPEG, FIRST = b"__jpeg__", b"channels_first"

@@ -7,7 +7,6 @@ compression is off at client and server, as in openpi.
 
 import asyncio
 import http
-import socket
 from collections.abc import Callable
 from contextlib import suppress
 from itertools import count
@@ -21,8 +20,8 @@ from websockets.http11 import Request, Response
 from skytether.policy.robot import LINE, FrameType
 from skytether.policy.values import MADE_BYTES_MAX
 from skytether.shared.endpoints.endpoint import Address, Datagram
-from skytether.shared.events.flight import address_text
-from skytether.shell.host.udp import AddressError, from_kernel, to_kernel
+from skytether.shell.host.tcp import listen_tcp
+from skytether.shell.host.udp import from_kernel
 
 ANSWERS_MAX = 16
 """Largest number of answers that a program has not read; then its connection is closed."""
@@ -31,7 +30,7 @@ Hear = Callable[[Datagram], None]
 Messages = asyncio.Queue[bytes | str]
 
 
-class ProgramLine:
+class ProgramServer:
     """Websocket server for the robot program; a new connection replaces the previous one.
 
     Raises:
@@ -43,13 +42,7 @@ class ProgramLine:
         self._connections: dict[int, tuple[ServerConnection, Messages]] = {}
         self._closing = set[asyncio.Task[None]]()
         self._numbers = count(1)
-        host, port = bind
-        try:
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._socket = socket.create_server(to_kernel((host, port)), family=family)
-        except OSError as error:
-            at = address_text(host, port)
-            raise AddressError(f"cannot listen on {at}: {error.strerror or error}") from None
+        self._socket = listen_tcp(bind)
         self.address: Address = from_kernel(self._socket.getsockname())
 
     def send(self, payload: bytes, peer: Address) -> bool:

@@ -10,7 +10,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from skytether.policy.robot import FrameType
-from skytether.policy.web import ANSWERS_MAX, PolicyLine, ProgramLine
+from skytether.policy.web import ANSWERS_MAX, PolicyLine, ProgramServer
 from skytether.shared.endpoints.endpoint import Address, Datagram
 
 PEER: Address = ("policy", 1)
@@ -23,8 +23,8 @@ class Heard(asyncio.Queue[Datagram]):
 
 
 @asynccontextmanager
-async def program_line(heard: Heard) -> AsyncIterator[tuple[ProgramLine, str]]:
-    line = ProgramLine(("127.0.0.1", 0), heard.put_nowait)
+async def program_line(heard: Heard) -> AsyncIterator[tuple[ProgramServer, str]]:
+    line = ProgramServer(("127.0.0.1", 0), heard.put_nowait)
     running = asyncio.create_task(line.run())
     yield line, f"ws://127.0.0.1:{line.address[1]}"
     running.cancel()

@@ -14,8 +14,8 @@ from collections.abc import Callable
 
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.endpoints.line import CLIENT, PIECE_BYTES, SERVER, Listen
-from skytether.shared.events.flight import address_text
-from skytether.shell.host.udp import AddressError, from_kernel, to_kernel
+from skytether.shell.host.tcp import listen_tcp
+from skytether.shell.host.udp import from_kernel
 
 HELD_MAX = 200
 """Number of pieces from an end that are under way, above which it is not read. Even with the data
@@ -87,13 +87,7 @@ class Connections:
         """Each direction of each connection, by its target's peer."""
         self._running: set[asyncio.Task[None]] = set()
         self._opened = 0
-        host, port = listen.bind
-        try:
-            family = socket.AF_INET6 if ":" in host else socket.AF_INET
-            self._socket = socket.create_server(to_kernel((host, port)), family=family)
-        except OSError as error:
-            at = address_text(host, port)
-            raise AddressError(f"cannot listen on {at}: {error.strerror or error}") from None
+        self._socket = listen_tcp(listen.bind)
         self._socket.setblocking(False)
         self.address: Address = from_kernel(self._socket.getsockname())
 
