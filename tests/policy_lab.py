@@ -1,9 +1,12 @@
 """Robot program and scripted policy in virtual time."""
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from mcap.reader import make_reader
 
 from skytether.client.secure import SecureLink
 from skytether.policy.robot import RobotOptions
@@ -29,6 +32,13 @@ def state(position: float) -> dict[str, Any]:
 
 def first_row(reply: Any) -> float:
     return float(reply["actions"][0, 0])
+
+
+def messages(path: Path) -> Iterator[tuple[str, Any]]:
+    """Topic and content of each message of a recording."""
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages():
+            yield channel.topic, json.loads(message.data)
 
 
 def entropy() -> Any:

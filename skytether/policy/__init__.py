@@ -15,6 +15,7 @@
 | `messages` | datagram format |
 | `values`, `images` | serialization of observations and actions |
 | `web` | websocket connections to the robot program and the policy server |
+| `recording` | calls in an MCAP file, with images |
 | `inside` | Python interface: `serve` and `Robot` |
 | `command` | `skytether policy serve` and `skytether policy join` |
 | `virtual` | both ends over an emulated network, in virtual time |

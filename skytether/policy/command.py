@@ -3,8 +3,8 @@
 import re
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -16,10 +16,13 @@ from skytether.policy import inside, metrics, web
 from skytether.policy.images import QUALITY, Compressor
 from skytether.policy.pace import RATE_MAX, RATE_MIN
 from skytether.policy.players import Clocked, Freshest, Player, Queue
-from skytether.policy.robot import CALL_COLUMNS, RobotEnd, RobotOptions
+from skytether.policy.recording import CallRecording
+from skytether.policy.robot import RobotEnd, RobotOptions
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Endpoint
+from skytether.shared.events.flight import Event
 from skytether.shared.events.processes import Counted, Listening
+from skytether.shared.telemetry.record import RECORDING
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
 from skytether.shell.commandline.command import CONFIGURATION, CommandError
@@ -29,7 +32,7 @@ from skytether.shell.host.paths import NetworkPath
 from skytether.shell.host.udp import AddressError, is_loopback
 from skytether.shell.processes.log import Log, LogFormat
 from skytether.shell.processes.metrics import Metric
-from skytether.shell.processes.process import recorded, serving
+from skytether.shell.processes.process import serving
 
 PLAYERS: dict[str, Callable[[], Player]] = {
     "clock": Clocked,
@@ -139,8 +142,7 @@ class JoinOptions(EndOptions):
     robot: Annotated[int, Argument(name="id")] = 1
     """Number of this robot and its key, 0 to 65535, unique at the server."""
     record: Path | None = None
-    """File for a record of each answer: time, kind, waiting time, age of the newest chunk, rows
-    computed by the policy."""
+    """MCAP file for the recording, which Foxglove shows: observations with images, and answers."""
 
 
 def policy(argv: Sequence[str]) -> None:
@@ -216,15 +218,17 @@ def join(argv: Sequence[str]) -> None:
         raise _wrong("--listen", options.listen, expected)
     for option in ("json", "record"):
         command.claim_output(f"--{option}", getattr(options, option))
+    if options.record and options.record.suffix != RECORDING:
+        raise _wrong("--record", options.record, f"a file that ends in {RECORDING}")
     link = inside.link_of(options.keys, options.robot)
     for path in paths:
         command.check_sealed(path.peer, secure=link.secure or options.insecure)
     # Socket 1 is the local connection, so the second path has number 2.
     numbered = {number + (number > 0): path for number, path in enumerate(paths)}
     with ExitStack() as stack:
-        recorder = None
+        recording = None
         if options.record:
-            recorder = stack.enter_context(recorded(options.record, CALL_COLUMNS)).recorder
+            recording = stack.enter_context(_recorded(options.record, options.actions_key))
         compress = Compressor(options.resize, options.quality, options.raw)
         end = RobotEnd(
             options.robot,
@@ -233,7 +237,7 @@ def join(argv: Sequence[str]) -> None:
             _robot_options(options),
             boot_id=secrets.randbits(63),
             compress=compress,
-            recorder=recorder,
+            on_answer=recording.note if recording else None,
         )
         listen = partial(web.ProgramServer, listen_at)
         shell = _shell(
@@ -243,7 +247,24 @@ def join(argv: Sequence[str]) -> None:
         def figures() -> dict[str, Any]:
             return end.figures() | {"image_bytes": compress.bytes}
 
-        _drive("policy join", figures, shell, options, "the robot program", metrics.JOIN)
+        hear = recording.hear if recording else lambda _: None
+        _drive("policy join", figures, shell, options, "the robot program", metrics.JOIN, hear)
+
+
+@contextmanager
+def _recorded(path: Path, key: str) -> Iterator[CallRecording]:
+    """Record calls to a file; if the disk fails, calls are answered and the command fails."""
+    try:
+        recording = CallRecording(path, key)
+    except OSError as error:
+        raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None
+    fault = ""
+    try:
+        yield recording
+    finally:
+        fault = recording.close()
+    if fault:
+        raise CommandError(fault)
 
 
 def _robot_options(options: JoinOptions) -> RobotOptions:
@@ -287,9 +308,10 @@ def _drive(
     options: EndOptions,
     waiting_for: str,
     table: Sequence[Metric],
+    beside: Callable[[Event], None] = lambda _: None,
 ) -> None:
     with (
-        closing(Log(name, options.log, lambda _: None)) as out,
+        closing(Log(name, options.log, beside)) as out,
         serving(options.metrics, name, "", 0.0, table) as served,
     ):
 

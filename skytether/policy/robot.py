@@ -20,8 +20,6 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, NamedTuple
 
-import numpy as np
-
 from skytether.client.link import ClientLink
 from skytether.policy import events, values
 from skytether.policy.exchange import Exchange
@@ -42,7 +40,6 @@ from skytether.policy.values import ValueRefused
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint, by_name
 from skytether.shared.events.flight import address_text
-from skytether.shared.telemetry.record import Recorder
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Refusal
 
@@ -63,17 +60,6 @@ MEASURED, DELAYS, ASKED_MAX = 9, 64, 1024
 whose chunks are accepted."""
 ROWS_SENT = 64
 """Largest number of next rows that are sent with an observation."""
-CALL_COLUMNS = np.dtype(
-    [
-        ("time_ns", "<i8"),  # time of the answer
-        ("robot", "<i8"),
-        ("call", "<i8"),  # number of the call
-        ("kind", "u1"),  # 0 fresh, 1 remaining rows, 2 hold, 3 error
-        ("waited_ns", "<i8"),  # time from the call to the answer
-        ("chunk_age_ns", "<i8"),  # age of the newest chunk's observation, -1: no chunk yet
-        ("left", "<i8"),  # rows of the answer computed by the policy
-    ]
-)
 KINDS = (Kind.FRESH, Kind.REST, Kind.HOLD, Kind.ERROR)
 
 
@@ -86,6 +72,25 @@ class FrameType(bytes, Enum):
     MESSAGE = b"m"
     ERROR = b"e"
     """Followed by the error message."""
+
+
+class AnsweredCall(NamedTuple):
+    """Call of the robot program and its answer."""
+
+    time_ns: int
+    """Time of the answer [ns]."""
+    number: int
+    kind: Kind
+    waited_ns: int
+    """Time from the call to the answer [ns]."""
+    chunk_age_ns: int
+    """Age of the newest chunk's observation [ns]; -1: no chunk yet."""
+    left: int
+    """Number of rows of the answer computed by the policy."""
+    sent: Any
+    """Observation with compressed images; None if it was not sent."""
+    reply: Any
+    """Reply to the program; None for an error."""
 
 
 @dataclass(frozen=True)
@@ -126,6 +131,8 @@ class _Call:
     """Serialized observation; empty if it is not sent."""
     again_ns: int
     """Time at which the observation is sent again, before the first chunk [ns]."""
+    sent: Any = None
+    """Observation with compressed images; None if it is not sent."""
 
 
 class _Asked(NamedTuple):
@@ -167,7 +174,7 @@ class RobotEnd(Endpoint):
         link: encryption of the datagrams, see `client.link`.
         boot_id: random number of this run.
         compress: compresses an observation before it is sent, see `images.Compressor`.
-        recorder: records an entry of CALL_COLUMNS for each answer.
+        on_answer: called after each answer; None: nothing is kept for it.
     """
 
     def __init__(
@@ -179,12 +186,12 @@ class RobotEnd(Endpoint):
         *,
         boot_id: int,
         compress: Callable[[Any], Any] = lambda observation: observation,
-        recorder: Recorder | None = None,
+        on_answer: Callable[[AnsweredCall], None] | None = None,
     ) -> None:
         super().__init__()
         self._robot, self._servers, self._link = robot, dict(servers), link
         self._options, self._boot_id, self._compress = options, boot_id, compress
-        self._recorder = recorder
+        self._on_answer = on_answer
         self._exchange: Exchange | None = None
         self._session = (0, 0)
         """Number of the session, and of the policy end's run."""
@@ -362,7 +369,8 @@ class RobotEnd(Endpoint):
             return
         try:
             observation = values.unpack(data, most=values.MADE_BYTES_MAX)
-            seen = values.pack(self._compress(observation))
+            compressed = self._compress(observation)
+            seen = values.pack(compressed)
             coming = None
             if self._wants_rows:
                 coming = schedule.coming(ROWS_SENT, now_ns=now_ns)
@@ -380,7 +388,7 @@ class RobotEnd(Endpoint):
         self._asked[call.number] = _Asked(now_ns, number, schedule.stood_ns, program.number)
         while len(self._asked) > ASKED_MAX:
             del self._asked[next(iter(self._asked))]
-        call.message = message
+        call.message, call.sent = message, compressed
         if self._exchange:
             self._exchange.send(OBSERVATION, message)
         before = self._asked.get(call.number - 1)
@@ -443,7 +451,7 @@ class RobotEnd(Endpoint):
         schedule.go(now_ns=now_ns)
         since_ns = now_ns if schedule.since_ns is None else schedule.since_ns
         held_s = (now_ns - since_ns) / SECOND_NS
-        message, left = b"", 0
+        message, left, reply = b"", 0, None
         if not error:
             try:
                 kind, reply, left = schedule.answer(kind, now_ns=now_ns)
@@ -467,9 +475,10 @@ class RobotEnd(Endpoint):
             self._late_ns = max(self._late_ns, waited_ns - self._options.deadline_ns)
         age_ns = now_ns - program.made_ns if program.newest >= 0 else -1
         self._age_ns, self._left = age_ns, left
-        if self._recorder:
-            row = (now_ns, self._robot, call.number, KINDS.index(kind), waited_ns, age_ns, left)
-            self._recorder.append_row(*row)
+        if self._on_answer:
+            given = None if error else reply
+            numbers = now_ns, call.number, kind, waited_ns, age_ns, left
+            self._on_answer(AnsweredCall(*numbers, call.sent, given))
         if error:
             self.send(FrameType.ERROR.value + error.encode(), program.peer, LINE)
         else:

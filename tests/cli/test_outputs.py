@@ -55,7 +55,7 @@ LINES = {
     "probe --figure": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT.png",
     "probe --record": "probe 127.0.0.1:9 --keys KEYS --duration 1 OUT",
     "policy --json": "policy join 127.0.0.1:9 --actions delta --keys KEYS OUT",
-    "policy --record": "policy join 127.0.0.1:9 --actions delta --keys KEYS OUT",
+    "policy --record": "policy join 127.0.0.1:9 --actions delta --keys KEYS OUT.mcap",
     "server --json": "server demo --keys KEYS OUT",
     "server --record": "server SCENARIO OUT",
     "netem --json": "netem SCENARIO OUT",

@@ -22,11 +22,10 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from helpers import LOOPBACK, SKYTETHER, Idle, refused
-from policy_lab import ramp
+from policy_lab import messages, ramp
 from skytether.__main__ import main
 from skytether.policy import PolicyError, Robot, values
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.telemetry.parts import parse
 from skytether.shell.driving.driver import Shell
 
 
@@ -127,7 +126,7 @@ def test_openpis_own_client_flies_through_both_commands(
     with socket.create_server(("127.0.0.1", 0)) as free:
         metrics = f"127.0.0.1:{free.getsockname()[1]}"
     bad = ("--to-server", "constant(30ms) & loss(10%)", "--to-client", "constant(30ms) & loss(10%)")
-    files = [f"--json={tmp_path / 'join.json'}", f"--record={tmp_path / 'calls.rows'}"]
+    files = [f"--json={tmp_path / 'join.json'}", f"--record={tmp_path / 'calls.mcap'}"]
     with (
         served(policy, *keys) as server,
         command("netem", "--bind", "127.0.0.1:0", "--server", server, *bad) as netem,
@@ -143,8 +142,12 @@ def test_openpis_own_client_flies_through_both_commands(
         client._ws.close()
     counted = json.loads((tmp_path / "join.json").read_text())
     assert counted["answers"] == {"fresh": 15, "rest": 0, "hold": 0, "error": 1}
-    rows = parse((tmp_path / "calls.rows").read_bytes())
-    assert rows["kind"].tolist() == [0] * 15 + [3]
+    recorded = list(messages(tmp_path / "calls.mcap"))
+    answers = [each for topic, each in recorded if topic == "/answers"]
+    assert [each["kind"] for each in answers] == ["fresh"] * 15 + ["error"]
+    assert answers[0]["actions"] == [[float(row)] for row in range(10)]
+    observed = [each for topic, each in recorded if topic == "/observation"]
+    assert observed[1] == {"call": 2, "state": [5.0], "prompt": "go on"}
     assert policy.seen[0]["prompt"] == "go on"
 
 
