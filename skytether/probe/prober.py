@@ -1,11 +1,11 @@
 """Probing end of a measurement: sends probes on a time grid, and records their answers.
 
-    HELLO until WELCOME → probes for the requested time → polls until all arrivals are known, and
-    the wait for the last answers is over
+    HELLO until WELCOME → probes for the requested time → polls until all arrivals are known and the
+    wait for the last answers has ended
 
-Sometimes a train of packets is sent at once, to measure the rate of the path. A train replaces
-twice as many probes as it has packets, so that a path fast enough for the probes empties its queues
-before the next probe, and delays are measured on an idle path.
+At intervals a train of TRAIN packets is sent at once, to measure the data rate of the path. A train
+takes the time of twice as many probes: if the path is fast enough for the probes, its queues are
+empty again before the next probe, whose delay is that of an idle path.
 """
 
 from array import array
@@ -43,11 +43,11 @@ PROBES_MAX = 1_000_000
 TRAIN = 16
 """Number of packets of a train."""
 TRAIN_SLOTS = 2 * TRAIN
-"""Number of regular probe slots that a train takes: twice its number of packets."""
+"""Number of grid points that a train takes, in place of one probe at each."""
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
 """Shortest time [ns], and smallest number of probes, from one train to the next."""
 HELLO_BYTES = 64
-"""Size of a HELLO without keys, longer than its WELCOME [B]."""
+"""Size of an unencrypted HELLO [B]: larger than a WELCOME, against amplification attacks."""
 PATIENCE_NS = 10 * SECOND_NS
 """Longest wait for the first answer [ns]."""
 POLL_NS = 100 * MILLISECOND_NS
@@ -61,7 +61,7 @@ Longs = NDArray[np.int64]
 class Way:
     """Packets of one direction, in order of sending.
 
-    Times are those of the sender's and receiver's monotonic clocks, with different zeros.
+    Sender and receiver read their own monotonic clocks; the two clocks have different zeros.
     """
 
     sent_ns: Longs
@@ -87,12 +87,12 @@ class MeasuredPath:
 
 
 class Prober(Endpoint):
-    """Sender of probes; stores their times of sending, arrival and answer.
+    """Sends probes, and stores the times at which they were sent, arrived and were answered.
 
     Args:
         link: encrypts outgoing packets, and opens incoming ones.
         listener: address of the other end.
-        nonce: NONCE_BYTES, different for each measurement.
+        nonce: NONCE_BYTES bytes, different for each measurement.
         probes: number of grid points, at most PROBES_MAX.
         period_ns: time between two grid points [ns].
         size: UDP payload of a probe, BYTES_MIN to PAYLOAD_BYTES_MAX [B].
@@ -125,10 +125,10 @@ class Prober(Endpoint):
         self._slot = 0
         """Number of the grid point at which the next probe is sent."""
         self._over_ns: int | None = None
-        """Time at which the last probe was sent [ns]; None before."""
+        """Time at which the last probe was sent [ns]; None until the last probe is sent."""
         self._longest_ns = 0
         self.refused = False
-        """Whether the listener has refused, because SESSIONS_MAX measurements are open."""
+        """Whether the listener has refused a session: SESSIONS_MAX measurements are open."""
         self.failed = False
         self._done = False
         self._sent_ns, self._train = array("q"), array("q")
@@ -141,7 +141,7 @@ class Prober(Endpoint):
         self._logged = 0
         """Number of arrivals that the listener has reported, or dropped."""
         self._total = 0
-        """Largest known number of arrivals at the listener."""
+        """Largest number of arrivals that an answer of the listener has stated."""
         self._settled = False
         self._trains = 0
         self._dropped: Counter[str] = Counter()
@@ -178,14 +178,14 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
     def _learn(self, answer: ProbeAnswer, now_ns: int) -> None:
-        # Without keys an attacker may send any number; more than twice the probes is impossible.
+        # Without keys an attacker can forge `logged`: more than two arrivals per probe are refused.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
             raise ProtocolError(Drop.FIELD)
         if any(number >= len(self._sent_ns) for number, _ in answer.arrivals):
             raise ProtocolError(Drop.FIELD)
         self._total = max(self._total, answer.logged)
         logged = self._logged
-        # the listener's memory was full: the arrivals in between were dropped
+        # the listener's memory was full: it has dropped the arrivals before `answer.first`
         if answer.first > logged:
             for _ in range(answer.first - logged):
                 self._logged_number.append(-1)
@@ -257,7 +257,7 @@ class Prober(Endpoint):
         self._train.append(number)
 
     def _poll(self, now_ns: int, over_ns: int) -> None:
-        """Request arrivals until all are known, or until LAST_MAX_NS after the last probe."""
+        """Request reports until all arrivals are known, or LAST_MAX_NS after the last probe."""
         waited_ns = now_ns - over_ns
         least_ns = min(max(LAST_MIN_NS, 2 * self._longest_ns), LAST_MAX_NS)
         if waited_ns >= LAST_MAX_NS or (waited_ns >= least_ns and self._logged >= self._total):
@@ -280,7 +280,7 @@ class Prober(Endpoint):
         return self._done
 
     def stop(self) -> None:
-        """End the measurement at the next wake, because that of another path has failed."""
+        """End this path's measurement, because the measurement of another path has failed."""
         self._done = True
 
     # -- results -------------------------------------------------------------------------------
@@ -301,8 +301,8 @@ class Prober(Endpoint):
     def measured(self) -> MeasuredPath:
         """Packets of both directions so far.
 
-        If the measurement was ended early, packets that may still be under way are left out:
-        packets after the newest one that is known to be received or lost.
+        After a measurement that was ended early, all packets newer than the newest reported arrival
+        are left out, because they may still be under way.
         """
         number = np.array(self._logged_number, np.int64)
         logged_ns = np.array(self._logged_ns, np.int64)
@@ -320,7 +320,7 @@ class Prober(Endpoint):
         downlink = self.measured().downlink
         number, answered = np.array(self._logged_number), np.array(self._answer_number)
         at = np.flatnonzero(answered < len(number))
-        # Reversed, so that of several answers to a probe the first is written last, and stays.
+        # Reversed, so that the first of several answers to a probe is written last, and stays.
         at = at[number[answered[at]] >= 0][::-1]
         probe = number[answered[at]]
         trip_s = np.full(len(self._sent_ns), np.nan)
@@ -340,7 +340,7 @@ class Prober(Endpoint):
         return Way(sent_ns[:end], came_ns[:end], came[:end], train[:end], copies)
 
     def _uplink(self, number: Longs, logged_ns: Longs) -> Way:
-        """Answers to probes; a lost answer's sending time is its probe's arrival time."""
+        """Answers to probes. The sending time of a lost answer is the arrival time of its probe."""
         answered = np.array(self._answer_number, np.int64)
         first, at = np.unique(answered[answered < len(number)], return_index=True)
         end = len(number) if self._settled else int(first.max(initial=-1)) + 1

@@ -12,7 +12,7 @@ from skytether.shared.formats.recorded import RecordedPath
 
 
 def of_log(path: RecordedPath) -> MeasuredPath:
-    """Measurement from a log: both directions are equal, on one clock."""
+    """Measurement from a log, with the same packets for both directions and one clock."""
     sent_ns = np.rint(path.time_s * SECOND_NS).astype(np.int64)
     delay_ns = np.rint(path.delay_s * SECOND_NS).astype(np.int64)
     came = ~path.lost

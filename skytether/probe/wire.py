@@ -11,7 +11,7 @@
 |      |         |          | padding                                             |
 
 HELLO and WELCOME have the types that a handshake of `shared.wire.handshake` may carry. The session
-is nonce and cookie together. A PROBE is padded to the requested size; its ANSWER is no longer.
+id is nonce and cookie. A PROBE is padded to the requested size; its ANSWER is at most as long.
 """
 
 from struct import Struct
@@ -23,14 +23,14 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 VERSION = 64
-"""Protocol version; different from a flight's, so that endpoints of a flight reject probes."""
+"""Protocol version; differs from the version of flights, so that their endpoints reject probes."""
 NONCE_BYTES = COOKIE_BYTES = 8
 SESSION_BYTES = NONCE_BYTES + COOKIE_BYTES
 MESSAGE_BYTES_MIN = 96
-"""Smallest size of a PROBE [B], with which its ANSWER has space for two arrivals."""
+"""Smallest size of a PROBE [B]: an ANSWER of this size has space for two arrivals."""
 TRAIN_MAX = 64
 NO_NUMBER = 2**32 - 1
-"""Number in a PROBE that only requests arrivals, and in its ANSWER."""
+"""Packet number in a PROBE that only requests a report of arrivals, and in its ANSWER."""
 
 _ARRIVAL = Struct("<IQ")
 _PADDING = bytes(PAYLOAD_BYTES_MAX)
@@ -56,9 +56,9 @@ class Probe(NamedTuple):
 
     session: bytes
     number: int
-    """Number of the packet, from 0; or NO_NUMBER."""
+    """Number of the packet, from 0; NO_NUMBER in a request for a report of arrivals."""
     train: int
-    """Number of packets of its train; 0 for a packet sent alone."""
+    """Number of packets of the train that the packet belongs to; 0 for a packet sent alone."""
     held: int
     """Number of arrivals whose reports the prober has received."""
 
@@ -68,7 +68,7 @@ class ProbeAnswer(NamedTuple):
 
     session: bytes
     number: int
-    """Number of the answered arrival, from 0; or NO_NUMBER."""
+    """Number of the answered arrival, from 0; NO_NUMBER in an answer to a request for a report."""
     sent_ns: int
     """Time of sending, on the listener's clock [ns]."""
     first: int
@@ -109,7 +109,7 @@ def _packed(kind: type[Message], fields: tuple[Any, ...], padding: bytes) -> byt
 
 
 def decode(payload: bytes) -> Message:
-    """Message in a datagram, every field checked.
+    """Decode the message in a datagram, and check every field.
 
     Raises:
         ProtocolError: the datagram is not one of these messages.

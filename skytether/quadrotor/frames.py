@@ -47,7 +47,7 @@ class Frame(NamedTuple):
     rate_gain: float
     """Gain from rate error to angular acceleration [1/s]."""
     rate_damping: float
-    """Gain of the measured angular acceleration, subtracted to compensate the rotors' lag."""
+    """Gain of the angular-acceleration feedback, which compensates the rotors' lag."""
 
     @property
     def hover(self) -> float:
@@ -139,8 +139,8 @@ SIH = Frame(
 )
 """PX4's simulation in hardware: `sih_params.c` of PX4 1.17, rotors of 1000 rad/s as in rotorpy.
 
-Its drag of 1 N per m/s is used here as rotor drag in hover. It has no battery model; that of the
-1.5 kg frame is used.
+Its drag of 1 N per m/s is used here as rotor drag in hover. It has no battery model; the battery
+here is that of the 1.5 kg frame.
 """
 
 FRAMES = {"crazyflie": CRAZYFLIE, "1.5kg": KG15, "sih": SIH}

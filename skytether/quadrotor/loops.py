@@ -33,13 +33,13 @@ class Gains(NamedTuple):
     acceleration_up: float
     """Largest vertical acceleration of the shaped velocity [m/s²]."""
     catch_up: float
-    """Gain K from the position error of the shaped motion to velocity [1/s]."""
+    """Gain K from the position error ∫(v* - v) dt of the shaped motion to velocity [1/s]."""
     p: float
     """Gain from horizontal velocity error to acceleration [1/s]."""
     i: float
     """Gain from the integral of the horizontal velocity error to acceleration [1/s²]."""
     d: float
-    """Gain of the measured horizontal acceleration, which is subtracted from the command."""
+    """Gain D of the measured horizontal acceleration; damps the velocity loop."""
     p_up: float
     """Gain from vertical velocity error to acceleration [1/s]."""
     i_up: float
@@ -81,8 +81,8 @@ PX4 = Gains(
     tilt_max=0.785,
 )
 """PX4 1.17: its defaults MPC_XY_VEL_P_ACC, _I_ACC and _D_ACC, MPC_Z_VEL_P_ACC and _I_ACC and
-MPC_TILTMAX_AIR. An external velocity set-point is not shaped. Both integrals are limited to g: the
-vertical one by itself, the horizontal one by the largest tilt."""
+MPC_TILTMAX_AIR. An external velocity set-point is not shaped. PX4 limits the vertical integral to
+g, and the horizontal integral by the largest tilt, here 45°: also g."""
 
 CRAZYFLIE = Gains(
     jerk=0.0,
@@ -98,19 +98,19 @@ CRAZYFLIE = Gains(
     integral_max=5.0,
     tilt_max=0.349,
 )
-"""Crazyflie's firmware: its defaults of `position_controller_pid.c`, velocity to tilt with 25° and
-1° per m/s, at most 20°, and to thrust 25 000 and 15 000 of 65 535, converted to accelerations of a
-Crazyflie. Its integrals do not reach their limits; 5 m/s² is assumed."""
+"""Crazyflie's firmware: its defaults of `position_controller_pid.c`, converted to accelerations.
+Gains P and I: 25° and 1° of tilt per m/s, at most 20°; vertically, 25 000 and 15 000 of 65 535
+units of thrust. Its integrals do not reach their limits; 5 m/s² is assumed."""
 
 AHEAD_MAX_M = 2.0
-"""Upper limit of the position error in the term with K [m]."""
+"""Largest position error ∫(v* - v) dt, on each axis [m]."""
 CELL_V = (0.0, 3.3, 3.6, 3.68, 3.75, 3.82, 3.95, 4.2)
 CELL_CHARGE = (-0.05, 0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
-"""Charges at the open-circuit voltages CELL_V of a lithium polymer cell; typical, not measured. The
-first entry extends the curve below charge 0.
+"""Remaining charge (1 is full) of a lithium polymer cell at the open-circuit voltages CELL_V [V];
+typical, not measured. The first entry extends the curve below charge 0.
 """
 CELL_FULL_V = 4.2
-"""Voltage of a full cell at rest."""
+"""Voltage of a full cell without load [V]."""
 
 
 class Quad(NamedTuple):
@@ -211,7 +211,7 @@ def point(frame: Frame, quad: Quad, force: F1, torque: F1) -> float:
     down = np.empty(3)
     for i in range(3):
         down[i] = -force[i] / size
-    # Right is the cross product of down and north; forward, that of right and down.
+    # Right is the cross product down × north; forward is right × down.
     right = np.array([0.0, down[2], -down[1]])
     length = np.sqrt(right[1] * right[1] + right[2] * right[2])
     for i in range(1, 3):

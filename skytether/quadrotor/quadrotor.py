@@ -16,7 +16,7 @@ from skytether.shared.base.kernel import plain
 from skytether.shared.law.model import Array
 
 UP = np.array([1.0, 1.0, -1.0])
-"""Signs that convert between north, east, down and x north, y east, altitude up."""
+"""Signs that convert (north, east, down) to (x north, y east, z up), and back."""
 
 
 class Attitude(NamedTuple):
@@ -47,7 +47,7 @@ class Quadrotor:
         position: initial position, at rest [m]; shape (3,).
         ground_m: altitude of the ground; None for no ground.
         charge: charge of its battery, from 0 to 1; infinite for a battery that never discharges.
-        hovers: whether it begins in hover, with rotors turning.
+        hovers: whether the quadrotor begins in hover; otherwise its rotors stand still.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class Quadrotor:
         self._air.turbulence[0] = turbulence_mps
 
     def advance(self, velocity: Array, duration_ns: int) -> None:
-        """Fly for a duration; a remainder of less than a step is added to the next call.
+        """Fly for a duration; a remainder of less than a step is added to the next duration.
 
         Args:
             velocity: commanded velocity [m/s]; shape (3,).
@@ -115,7 +115,7 @@ class Quadrotor:
     def wanted_position(self) -> Array:
         """Position of the shaped motion, which the control loops track [m]; shape (3,).
 
-        Without a position loop (`Gains.catch_up` 0) it is the true position.
+        Without a position loop (`Gains.catch_up` 0), the true position.
         """
         ahead = self._quad.wanted[6:] if self.gains.catch_up else 0.0
         wanted: Array = UP * (self._quad.x[:3] + ahead)

@@ -1,13 +1,13 @@
-"""Names of topics and nodes on a Zenoh network, as in rmw_zenoh (docs/design.md there).
+"""Names of topics and nodes on a Zenoh network, as in `docs/design.md` of rmw_zenoh.
 
     topic       <domain>/<topic>/<type>/<type hash>
     token       @ros2_lv/<domain>/<session>/<node>/<entity>/<kind>/<enclave>/<namespace>/<name>
                 and, of a publisher or a subscriber, /<topic>/<type>/<type hash>/<quality>
     attachment  sequence number (8 B), time stamp (8 B), 16 (1 B), identity (16 B)
 
-In a token each `/` of a name is `%`; enclave and namespace of our nodes are empty. Tokens are
-Zenoh's liveliness tokens: they end with their session, and `ros2 topic list` shows topics with a
-token. Numbers are little-endian.
+In a token each `/` of a name is written `%`; enclave and namespace of our nodes are empty. Tokens
+are Zenoh's liveliness tokens: they end with their session, and `ros2 topic list` shows topics with
+a token. Numbers are little-endian.
 """
 
 import struct
@@ -57,13 +57,13 @@ class Node:
     publishes: Topic
     subscribes: Topic
     alternatives: tuple[Topic, ...] = ()
-    """The published topic with alternative types; if there are any, the first message to publish
-    determines the type."""
+    """The published topic with each further message type that it may have. If there are any, the
+    first message to publish determines the type."""
 
     @property
     def forms(self) -> tuple[Topic, ...]:
-        """The published topic, once for each type that it may have. The address of a message to
-        publish contains an index of this list.
+        """The published topic, once for each type that it may have. The peer of a message to
+        publish is the topic's name and an index of this list.
         """
         return self.publishes, *self.alternatives
 
@@ -83,8 +83,8 @@ class Node:
 
     @property
     def others(self) -> list[str]:
-        """Patterns for tokens of other publishers and subscribers of the topic that we publish, and
-        of publishers of the topic that we subscribe to.
+        """Patterns of tokens that the node watches: tokens of other publishers and subscribers of
+        its published topic, and of publishers of its subscribed topic.
         """
         out, into = mangled(self.publishes.name), mangled(self.subscribes.name)
         pairs = ((PUBLISHER, out), (SUBSCRIBER, out), (PUBLISHER, into))
@@ -142,8 +142,8 @@ def attachment(number: int, stamp_ns: int, publisher: bytes) -> bytes:
 
 
 def session_settings(node: Node) -> dict[str, object]:
-    """Settings of a Zenoh session, as in rmw_zenoh: no multicast; peers find each other by gossip,
-    so that they continue without the router.
+    """Settings of a Zenoh session, as in rmw_zenoh: no multicast; peers learn of each other by
+    gossip, so that they stay connected if the router fails.
     """
     host = f"[{node.host}]" if ":" in node.host else node.host
     return {

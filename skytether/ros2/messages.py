@@ -1,4 +1,4 @@
-"""Messages of ROS 2 in CDR, encoded by rosbags: only the types used here."""
+"""Messages of ROS 2, encoded and decoded in CDR by rosbags: only the types that Skytether uses."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ PARTS = (
     *(f"geometry_msgs/msg/{name}" for name in ("PoseWithCovariance", "TwistWithCovariance")),
 )
 STORE = Typestore()
-# Loading only these types takes a tenth of the time and memory for a distribution's types.
+# Loading only these types takes a tenth of the time and memory of loading all types of ROS 2.
 USED = (*PARTS, TWIST, TWIST_STAMPED, ODOMETRY, POSE_STAMPED, PATH)
 STORE.register({kind: FIELDDEFS[kind] for kind in USED})
 POSE_PARTS = "Point", "Pose", "PoseStamped"
@@ -43,14 +43,14 @@ class Odometry(NamedTuple):
     frame: str
     """Fixed frame of position and rotation."""
     child: str
-    """Frame of the velocities, which is the robot's."""
+    """Frame of the velocities, fixed to the robot."""
     position: Vector
     """Position of the robot in the fixed frame [m]."""
     rotation: Rotation
     velocity: Vector
-    """Velocity in the child frame [m/s]."""
+    """Velocity of the robot in the frame `child` [m/s]."""
     turn: Vector
-    """Angular velocity in the child frame [rad/s]."""
+    """Angular velocity of the robot in the frame `child` [rad/s]."""
 
 
 class Goal(NamedTuple):
@@ -126,7 +126,7 @@ def twist_stamped(stamp_ns: int, frame: str, linear: Vector, turn: float) -> byt
 
 
 def path(stamp_ns: int, frame: str, positions: Sequence[Vector]) -> bytes:
-    """Encode nav_msgs/Path: positions in a frame [m], with equal stamps, without rotation."""
+    """Encode nav_msgs/Path: positions in a frame [m], all with the same time stamp, not rotated."""
     types: Any = STORE.types
     point, pose, stamped = (types[f"geometry_msgs/msg/{name}"] for name in POSE_PARTS)
     level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)

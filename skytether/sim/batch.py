@@ -53,19 +53,19 @@ def fly_batch(
     """Fly a scenario once for each of these seeds, many times faster than one by one.
 
     Each flight equals that of `fly` with the same seed, to the last bit, except that the server's
-    `figures` contain only the drops. If the server's computing time exceeds a step, the runs are
-    flown one by one, because which ticks the server misses depends on its start.
+    `figures` only count dropped datagrams. If the server's computing time exceeds a step, the runs
+    are flown one by one, because the ticks that it misses then depend on its start.
 
     Args:
         seeds: different seeds that replace the scenario's.
         changes, stopped: as in `fly`.
-        on_second: as in `fly`; the time restarts every COMPANY_MAX runs.
+        on_second: as in `fly`; the time restarts at 0 after every COMPANY_MAX runs.
 
     Raises:
         ConfigError: a plug-in raised an exception.
     """
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
-    # Vehicles of one server share its budget of bytes, and on a mission avoid each other.
+    # Runs would affect each other: vehicles of one server share its bytes/s, or avoid each other.
     alone = not in_time or scenario.keeps_apart or scenario.control.shared_bytes_per_s
     company = 1 if alone else COMPANY_MAX
     shared: dict[str, Any] = {"make_server": SharedServer, "figures_of": _dropped}

@@ -80,7 +80,7 @@ PLAIN = Plain()
 
 
 class Alone:
-    """Servers of a flight: one; `standby.WithStandby` has a second one that takes over."""
+    """The server of a flight; `standby.WithStandby` adds a second server, which takes over."""
 
     def networks(self, scenario: Scenario) -> list[tuple[Address, Scenario]]:
         """Address of the server behind each network of a vehicle, and the network's scenario."""
@@ -95,7 +95,7 @@ class Alone:
         return reach
 
     def others(self, seed: int, started: Callable[..., Server]) -> dict[str, Endpoint]:  # noqa: ARG002
-        """Further servers of the flight, by host name; `started` makes one."""
+        """Further servers of the flight, by host name; `started` makes a server."""
         return {}
 
 
@@ -167,7 +167,7 @@ class Run:
     Args:
         scenario: scenario to fly, with the run's seed.
         server_rows: returns the number of rows that the server has recorded so far.
-        server_figures: returns the server's figures so far about the datagrams of these hosts.
+        server_figures: returns the server's figures so far about the datagrams of given hosts.
         number: number of the run, from 0; its vehicles are numbered after those of earlier runs.
         vehicles: number of vehicles.
         ends: makes the ends of links.
@@ -263,7 +263,7 @@ class Run:
         }
 
     def flight(self, server_rows: Rows) -> Record:
-        """Record of the run, with vehicles numbered from 1, from the server's rows of all runs."""
+        """Record of the run, vehicles numbered from 1; `server_rows` has the rows of all runs."""
         server_end, netem_end = self._ends
         client, netem = self.steps.rows().copy(), self._packets.rows()[:netem_end]
         server = server_rows[:server_end]
@@ -316,7 +316,7 @@ def fly_runs(
             run_of[host].hear(time_ns, host, event)
 
     world = Hosts(on_event)
-    # Actions may stop hosts, and a host that is not plain may save its state: a `World` has both.
+    # Actions may stop hosts, and other endpoints may save state: only a `World` supports both.
     if actions or own_server or beside or servers is not ALONE:
         world = load("skytether.sim.world", "actions").World(on_event)
     entropy = stream(scenario.seed, "entropy").bytes
@@ -392,7 +392,7 @@ def fly_runs(
 
 
 def _tell_time(world: Hosts, hosts: Mapping[str, Endpoint], error_ns: int) -> None:
-    """Give the hosts a time of day, wrong by +`error_ns` and -`error_ns` in turn; none if 0."""
+    """Give the hosts a time of day, wrong by -`error_ns` and +`error_ns` in turn; no time if 0."""
     for number, (host, each) in enumerate(hosts.items() if error_ns else ()):
         wrong_ns = error_ns if number % 2 else -error_ns
         world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))

@@ -2,9 +2,9 @@
 
 A datagram takes no time between endpoints; delays come from netem, which is an endpoint too. Every
 host has its own clock, with offset and drift. A host may need computing time when it is woken: its
-datagrams leave at the end of that time, and only then can it be woken again. It receives datagrams
-meanwhile, so computing for one peer does not delay the datagrams of another. A `sim.world.World`
-can stop hosts, too, and saves the state of their endpoints.
+datagrams leave at the end of that time, and only then can it be woken again. The host receives
+datagrams meanwhile, so computing for one peer does not delay the datagrams of another peer. A
+`sim.world.World` can stop hosts, too, and saves the state of their endpoints.
 
 Time is integer nanoseconds, and events of one instant happen in a fixed order. So equal inputs give
 equal outcomes on every machine, and hosts that exchange no datagrams do not affect each other.
@@ -36,7 +36,7 @@ class Clock:
         return shown_ns + time_ns * self.drift_ppb // BILLION if self.drift_ppb else shown_ns
 
     def world(self, local_ns: int) -> int:
-        """First time of the world at which the clock shows at least this time."""
+        """First time of the world [ns] at which the clock shows `local_ns` or more."""
         passed_ns = local_ns - self.offset_ns
         if not self.drift_ppb:
             return passed_ns
@@ -56,7 +56,7 @@ class Host:
     busy_until_ns: int
     """Time of the world until which the host computes [ns]; it cannot be woken before."""
     on_finished: Callable[[], None] | None
-    """Callback for the end of the endpoint; None once called."""
+    """Function to call once, when the endpoint has finished; None afterwards."""
     armed_ns: int | None = None
     """Time of the world at which the host is to be woken [ns]; None for never."""
     due_ns: int | None = None
@@ -93,7 +93,7 @@ class Hosts:
             | tuple[int, int, int, None, Callable[[], None]]
         ] = []
         """Heap of future events: time, rank, order of entry, host, and the arriving datagram, or
-        None for a wake; an action has a function in place of the host.
+        None for a wake; an action has no host, and a function in place of the datagram.
         """
         self._scheduled = 0
         self._look_ns = 0
@@ -148,8 +148,8 @@ class Hosts:
 
         Args:
             limit_ns: time of the world at which the run ends at the latest [ns].
-            every_ns: least time between two checks of the condition [ns], which is also checked
-                when an endpoint finishes.
+            every_ns: shortest time between two checks of the condition [ns]; the condition is also
+                checked when an endpoint finishes.
         """
         agenda, arriving = self._agenda, self._arriving
         self._look_ns = self.now_ns
@@ -170,7 +170,7 @@ class Hosts:
                 entry[4]()
             elif entry[4] is not None:
                 self._receive(entry[3], entry[4])
-            elif entry[3].armed_ns == self.now_ns:  # otherwise its next wake has been changed
+            elif entry[3].armed_ns == self.now_ns:  # otherwise the next wake has been changed
                 host = entry[3]
                 host.armed_ns = None
                 host.endpoint.wake(now_ns=host.clock.local(self.now_ns))

@@ -15,7 +15,7 @@ Run = TypeVar("Run", bound=Endpoint)
 class VirtualProcess(Generic[Run]):
     """Process of a host; `endpoint` is its newest run. The caller adds the first run to the world.
 
-    Its methods take the world first, so that they can be `actions` of `sim.flight.fly`.
+    The world is each method's first argument, so that methods can be `actions` of `sim.flight.fly`.
 
     Args:
         host: name of the host.
@@ -37,7 +37,7 @@ class VirtualProcess(Generic[Run]):
         world.stop(self.host)
 
     def close(self, world: World) -> None:
-        """End the run at once if it is up, after its last datagrams, as a second SIGTERM does."""
+        """End the run at once if it is up, as a second SIGTERM does; sends its last datagrams."""
         if self.is_up:
             world.act(self.host, self.endpoint.close)
         self.kill(world)

@@ -14,7 +14,7 @@ STANDBY: Address = ("standby", 0)
 
 
 class WithStandby(Alone):
-    """Servers of a flight: one, and its standby.
+    """Servers of a flight: a server and its standby.
 
     Args:
         standby: endpoint in place of the standby server; True: a `Server`.

@@ -14,7 +14,7 @@ from skytether.shared.events.flight import Event
 from skytether.sim.hosts import Clock, Host, Hosts
 
 FROZEN_MAX = 6_500
-"""Largest number of datagrams queued for a frozen host: a socket's buffer holds as many of 600 B.
+"""Largest number of datagrams queued for a frozen host: a socket's buffer holds 6500 of 600 B.
 """
 
 
@@ -66,7 +66,7 @@ class World(Hosts):
     def __init__(self, on_event: Callable[[int, str, Event], None] = lambda *_: None) -> None:
         super().__init__(on_event)
         self._memories: dict[str, tuple[bytes, int]] = {}
-        """State that an endpoint of each host saved last, and when [ns; host's clock]."""
+        """Newest state that an endpoint of each host has saved, and its time [ns; host's clock]."""
 
     def endpoint(self, name: str) -> Endpoint:
         """Endpoint of a host, also while it is down or frozen."""
@@ -100,7 +100,7 @@ class World(Hosts):
         return self._memories.get(name)
 
     def freeze(self, name: str) -> None:
-        """Freeze a host: datagrams are queued for it, up to a bound.
+        """Freeze a host: datagrams for it are queued, at most FROZEN_MAX.
 
         No effect on a host that is down or already frozen.
         """

@@ -1,14 +1,14 @@
-"""Hypotheses: whether the theorem of separation's assumptions held in a flight, with margins.
+"""Hypotheses: whether the assumptions of the theorem of separation held in a flight, with margins.
 
 docs/together-proof.md has the theorem and its five conditions. This module checks them from the
 record of a flight, at each step of each vehicle: the vehicle's rows have its position and the
 motion in force, the server's rows have the motions. In flight the server checks the same
 conditions, but only knows what observations report.
 
-A motion is recorded as its first state and the inputs of `control.horizon` steps. It may last up to
-140 steps: later steps are not checked, unless the vehicle rests by then. With a horizon of 131
-steps or more, everything is recorded. Clocks and their bounds at each step are not recorded: only
-the server's counts of violations are.
+A motion is recorded as its first state and the inputs of `control.horizon` steps. A motion may last
+up to 140 steps. Steps after the recorded ones are not checked, unless the motion has come to rest
+by then. With a horizon of 131 steps or more, everything is recorded. Clocks and their bounds are
+not recorded at each step; the server only counts violations.
 """
 
 import math
@@ -52,8 +52,8 @@ class Hypothesis:
     step: int | None = None
     """Step of the smallest margin, as counted by the first of `vehicles`."""
     checked: float = 1.0
-    """Share of the steps or motions that can be checked from the record; 0 for counters, which are
-    in no row."""
+    """Share of the steps or motions that the record suffices to check; 0 for a hypothesis that is
+    checked by a counter."""
 
     @property
     def is_held(self) -> bool | None:
@@ -70,7 +70,7 @@ class Motions:
     position: Array
     """Positions of each motion at its steps [m]; shape (n, H + 1, axes)."""
     moves: Indices
-    """Number of steps until each motion rests; H + 1 if that is not recorded."""
+    """Number of steps until each motion comes to rest; H + 1 if its end is not recorded."""
 
     @property
     def recorded(self) -> int:
@@ -93,7 +93,7 @@ def motions(scenario: Scenario, plan: Rows) -> Motions:
     velocity[:, 0] = plan["state"][:, :, 1]
     for k in range(inputs.shape[2]):
         velocity[:, k + 1] = model.a11 * velocity[:, k] + model.b1 * inputs[:, :, k]
-    for _ in range(-inputs.shape[2] % SPACING):  # continue to the next knot
+    for _ in range(-inputs.shape[2] % SPACING):  # extrapolate to the next knot
         velocity = np.append(velocity, 2.0 * velocity[:, -1:] - velocity[:, -2:-1], axis=1)
     # Between knots, and so between steps, a motion's acceleration is constant.
     moved = np.cumsum(0.5 * dt_s * (velocity[:, :-1] + velocity[:, 1:]), axis=1)
@@ -130,7 +130,7 @@ class Flown:
 
     @property
     def changed(self) -> Indices:
-        """Rows whose motion in force differs from the previous row's, in one run of the client."""
+        """Rows at which the motion in force changes, except by a restart of the client."""
         same_run = np.diff(self.step) > 0
         return 1 + np.flatnonzero((np.diff(self.in_force) != 0) & same_run)
 
@@ -183,11 +183,11 @@ def _least(
     margins: Mapping[int, tuple[Indices, Array]],
     at_most: float = UNCHECKED,
 ) -> Hypothesis:
-    """Hypothesis with the smallest of some margins.
+    """Hypothesis with the smallest margin of all vehicles and steps.
 
     Args:
         margins: for each vehicle, steps and their margins, NaN if not checked.
-        at_most: margin if there are none.
+        at_most: margin if no vehicle has a step in `margins`.
     """
     count = sum(len(steps) for steps, _ in margins.values())
     each = [
@@ -253,7 +253,7 @@ def _steps_in_time(scenario: Scenario, record: Record) -> Hypothesis:
 
 
 def _acceptance(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that a motion is accepted from its first knot until `link.join_s` later."""
+    """Check that each motion is accepted between its first knot and `link.join_s` later."""
     margins, join = {}, scenario.terms().join
     for each in vehicles:
         taken = each.changed[each.in_force[each.changed] >= 0]
@@ -264,7 +264,7 @@ def _acceptance(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
 
 
 def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that motions are flown to their end; margin: time in force after the end."""
+    """Check that motions are flown to their end; margin: time in force beyond the end."""
     margins = {}
     for each in vehicles:
         left = each.changed[each.in_force[each.changed] < 0]
@@ -280,7 +280,7 @@ def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothes
 
 
 def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that all vehicles were observed before any moves; margin: the time between."""
+    """Check that the server observed all vehicles before one moved; margin: the time between."""
     name, mission = "the server observes all first", scenario.make_reference()
     assert isinstance(mission, Mission)
     server = record.server
@@ -312,8 +312,8 @@ def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown])
 
 
 def _clocks(record: Record) -> Hypothesis:
-    """Clock samples that contradict the clock's bounds, counted by the server, because clocks are
-    in no row.
+    """Check that no clock sample contradicted the clock's bounds, from the server's counters,
+    because rows contain no clocks.
     """
     name = "no clock contradicts its bounds"
     if "server" not in record.figures:

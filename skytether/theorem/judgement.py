@@ -1,4 +1,4 @@
-"""Judgement of a mission's flight: what the theorem assumes, and who waited for whom."""
+"""Judgement of a mission's flight: whether the theorem's assumptions held, and who waited."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -12,7 +12,7 @@ from skytether.theorem.waits import Reason, Wait, waits
 WAITS_SHOWN = 6
 """Largest number of waits of a kind that are listed."""
 SHORT_S = 1.0
-"""Length of waits for acknowledgements that are usual if nothing was lost [s]."""
+"""Longest usual wait for an acknowledgement if no packet is lost [s]."""
 
 TITLE = "What the theorem of separation assumes"
 HEADING = "condition", "", "held", "margin", "of vehicle", "at step", "checked"
@@ -20,11 +20,11 @@ HEADING = "condition", "", "held", "margin", "of vehicle", "at step", "checked"
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """What a mission's record says of the theorem, and of waits; its text is both."""
+    """Hypotheses of the theorem, and waits, of a mission's flight; `str` makes a text of both."""
 
     hypotheses: tuple[Hypothesis, ...]
     waits: tuple[Wait, ...] = ()
-    """The longest first; empty of a flight over UDP."""
+    """Waits, the longest first; empty for a flight over UDP."""
 
     @property
     def rows(self) -> list[Sequence[str]]:
@@ -36,7 +36,7 @@ class Judgement:
 
 
 def judged(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) -> Judgement:
-    """Judgement of a mission's flight, over UDP without waits; `reasons`: see `waits`."""
+    """Judgement of a mission's flight; without waits if flown over UDP. `reasons`: see `waits`."""
     return Judgement(hypotheses(record, scenario), waits(record, scenario, reasons))
 
 
@@ -91,7 +91,7 @@ def _when(each: Wait) -> str:
 
 
 def _packets(each: Wait, whose: str) -> str:
-    """Text on the motion that was not acknowledged, and its lost packets."""
+    """Text about the motion that was not acknowledged, and its lost packets."""
     lost = [
         f"{count[1]} of {count[0]} {what}{'s' * (count[0] != 1)} lost"
         for count, what in ((each.plans, "packet"), (each.reports, "answer"))

@@ -1,13 +1,13 @@
 """Waits: which vehicle of a mission waited for which, and for which packet.
 
-The server sends a vehicle a motion every `motion.SPACING` steps, unless it has arrived. It waits
+The server sends a vehicle a motion every `motion.SPACING` steps, unless it has arrived or waits
 
     to begin          until every vehicle of the mission flies a first motion
-    acknowledgement   until the server has observed whether it flies its newest motion
+    acknowledgement   until the server has observed whether the vehicle flies its newest motion
     way               because no motion towards its goal keeps away from another vehicle, or a zone
 
-The first two follow from the rows of a record. The third does not: the server's figures contain it
-for each decision (`waits`), which `questions` reads while the flight is flown again.
+The first two kinds follow from the rows of a record. Waits for a way are only in the server's
+figures (`waits`), which `questions` reads at each decision while the flight is flown again.
 """
 
 import math
@@ -31,7 +31,7 @@ from skytether.theorem.hypotheses import Flown, began_ns, flown
 AT_ONCE_S = 1e-3
 """Tolerance of times [s]."""
 OTHER = re.compile(r"vehicle (\d+)( to pass)?|a zone")
-"""Pattern of the server's text on a vehicle that waits for a free way."""
+"""Regular expression for the server's text about a vehicle that waits for a free way."""
 
 Reason: TypeAlias = tuple[float, int, str]
 """Time of flight [s], vehicle, and what it waits for, as the server's text."""
@@ -77,9 +77,9 @@ class _Vehicle:
     sent_at: Indices
     """Number of the tick at which each motion was sent first."""
     heard_at: Indices
-    """Number of the tick at which the server knew of each motion's acceptance, or the last."""
+    """Number of the tick at which the server knew whether each motion was accepted, or the last."""
     is_heard: Flags
-    """Whether the server knew it at the tick in `heard_at`."""
+    """Whether the server knew at the tick in `heard_at` if the motion was accepted."""
     accepted: Indices
     """Step from which the vehicle flew each motion; -1 if it never did."""
 
@@ -90,7 +90,7 @@ class _Vehicle:
 
 
 def questions(scenario: Scenario, reasons: list[Reason]) -> Iterator[Question]:
-    """Actions that append what the server says vehicles wait for, once for each decision."""
+    """Actions that append the server's texts about vehicles that wait, once for each decision."""
 
     def ask(world: World) -> None:
         for vehicle, figures in world.endpoint(flight.SERVER[0]).figures()["by_vehicle"].items():
@@ -107,7 +107,7 @@ def waits(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) ->
 
     Args:
         record: flight in virtual time.
-        reasons: what the server reported every SPACING steps; if empty, no waits for a way.
+        reasons: the server's texts every SPACING steps; if empty, waits for a way are left out.
     """
     vehicles = list(_vehicles(record, scenario))
     found, is_plan = [*_to_begin(vehicles)], are_plans(record, record.netem, scenario.dt_ns)
@@ -127,7 +127,7 @@ def _vehicles(record: Record, scenario: Scenario) -> Iterator[_Vehicle]:
             continue
         at = [np.flatnonzero(each.in_force == first) for first in sent.tolist()]
         accepted = np.array([int(each.step[own[0]]) if len(own) else -1 for own in at])
-        # A motion not accepted by then is never accepted.
+        # A motion that is not accepted within `join` steps is never accepted.
         certain = np.where(accepted >= 0, accepted, sent + join + 1)
         heard_at = np.searchsorted(rows["observed_step"], certain).clip(0, len(rows) - 1)
         time_s = (left_ns + tick[is_own] * scenario.dt_ns) / SECOND_NS
@@ -136,7 +136,7 @@ def _vehicles(record: Record, scenario: Scenario) -> Iterator[_Vehicle]:
 
 
 def _sent_at(rows: Rows, sent: Indices) -> Indices:
-    """First row with each of some steps; the server's count of steps may go back."""
+    """Index of the first row with each step; step numbers by the server's count may go back."""
     first = dict(zip(rows["step"][::-1].tolist(), range(len(rows))[::-1], strict=True))
     return np.array([first[step] for step in sent.tolist()])
 

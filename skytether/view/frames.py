@@ -20,7 +20,7 @@ PROCESSES = {"client": "client", "server": "server", "plan": "server", "netem": 
 
 
 def of_flight(scenario: Scenario, name: str, flight: Record) -> Iterator[Timed]:
-    """Frames of a flight in virtual time, ordered by time, which begins at 0.
+    """Frames of a flight in virtual time, in order of time, from time 0 on.
 
     Args:
         name: name of the scenario.

@@ -46,9 +46,9 @@ FLOWN_S_MAX = 2 * 86_400.0
 TIMES = "arrived_ns", "time_ns", "due_ns"
 """Columns with times on a process's clock."""
 TIME_NS_MAX = 2**62
-"""Largest accepted time on such a clock [ns]."""
+"""Largest accepted time on a process's clock [ns]."""
 DELAY_NS_MAX = 86_400 * SECOND_NS
-"""Longest delay of a packet that is accepted [ns]."""
+"""Longest accepted delay of a packet [ns]."""
 NUMBER_MAX = 1e100
 """Largest number accepted in a row, so that squares do not overflow."""
 
@@ -59,9 +59,9 @@ Columns = dict[str, NDArray[Any]]
 def plain(columns: np.dtype[np.void]) -> np.dtype[np.void]:
     """Plain columns of the record's row type, at the same offsets in memory.
 
-    A state, of shape (axes, 2), becomes `position_x_m`, `velocity_x_mps` and so on, prefixed by its
-    name unless that is `state`. Velocities, of shape (axes,), or (axes, steps) for the inputs of a
-    plan, become `input_x_mps` and so on.
+    A state, of shape (axes, 2), becomes `position_x_m`, `velocity_x_mps` and so on, prefixed by the
+    column's name unless it is `state`. Velocities, of shape (axes,), or (axes, steps) for the
+    inputs of a plan, become `input_x_mps` and so on.
 
     Raises:
         ValueError: a column is neither a number nor of these shapes.

@@ -13,10 +13,10 @@ class Argument:
     """Annotation of a field: how its option is written on the command line."""
 
     name: str | None = None
-    """Name of the flag, if different from the field's; "": each field of the value has a flag."""
+    """Name of the flag; None for the field's name; "" for one flag per field of the value."""
     metavar: str | None = None
     help: str | None = None
-    """Text of the help, if different from the field's docstring."""
+    """Help text of the option; None for the field's docstring."""
     positional: bool = False
     append: bool = False
     """Whether the flag may be repeated, with one value each time."""

@@ -96,13 +96,13 @@ def parse(
     leads: bool = True,
     is_final: bool = True,
 ) -> O:
-    """Parse a command line; returns the options, with the named scenario and its changed keys.
+    """Parse a command line; returns its options, with the named scenario as changed by flags.
 
-    The scenario is checked once, with its final values, because a flag may correct a contradiction
+    The scenario is checked once, with its final values, because a flag may resolve a contradiction
     in the file.
 
     Args:
-        leads: whether a positional first argument is the scenario's name.
+        leads: whether the scenario's name may be the first argument, without a flag.
         is_final: whether to check the scenario; False for a command that changes further keys and
             checks the scenario itself.
 
@@ -236,7 +236,7 @@ def refuse_errors(plugin_errors: Mapping[str, int] | None) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Handle Ctrl-C and SIGTERM in the block; yields a function that returns whether one came."""
+    """Catch Ctrl-C and SIGTERM in the block; yields a function that tells whether one has come."""
     interrupted = threading.Event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]
@@ -261,7 +261,7 @@ def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, p
         return _refuse(prog, str(error), CONFIGURATION)
     except KeyboardInterrupt:  # Ctrl-C before `interruptible` was entered
         return INTERRUPTED
-    # caused by the machine: a full disk, too few open files, a broken pipe
+    # errors of the machine, not of Skytether: a full disk, too few open files, a broken pipe
     except OSError as error:
         # the reader of our output has closed the pipe, as `head` does
         is_closed = isinstance(error, BrokenPipeError)

@@ -38,7 +38,7 @@ class OptionText(NamedTuple):
 
 
 def help_text(default: Any, prog: str, about: str) -> str:
-    """Help of a command, with `default` as the default options."""
+    """Help text of a command; the values of the options in `default` are shown as defaults."""
     groups: dict[str, list[OptionText]] = {title: [] for title in (ARGUMENTS, OPTIONS, *GROUPS)}
     group_of = {flag: title for title, flags in GROUPS.items() for flag in flags}
     flies, arguments = hasattr(default, "config"), []
@@ -67,7 +67,7 @@ def help_text(default: Any, prog: str, about: str) -> str:
 
 
 def keys_text(scenario: Scenario, prog: str) -> str:
-    """Help of a scenario's keys, with its values as defaults."""
+    """Help text of a scenario's keys; the scenario's values are shown as defaults."""
     groups: dict[str, list[OptionText]] = {}
 
     def add(section: msgspec.Struct, prefix: str, title: str) -> None:
@@ -124,7 +124,7 @@ def _metavar(hint: Any, text: str) -> str:
 
 
 def _with_default(text: str, value: Any, *, required: bool = False) -> str:
-    """Text of an option, with its default if a user could type it."""
+    """Help text of an option, followed by its default if a user could type this value."""
     if required:
         return f"{text} (required)"
     if value is None or value is False or value in ("", (), math.inf):

@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
-    """Options of a command line, defaults where it has none; `help_` describes the command.
+    """Options of a command line, and the others from `default`; `help_` describes the command.
 
     Raises:
         ConfigError: a flag is wrong, or a plug-in cannot be imported.
@@ -61,7 +61,7 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
 
 
 def refusal(frame: str, options: type, prog: str) -> str:
-    """Sentence about a wrong command line, made from the box of text that tyro prints."""
+    """Error message about a wrong command line, made from the frame of text that tyro prints."""
     lines = (line.strip("│ ") for line in frame.splitlines() if line.startswith("│"))
     said = " ".join(takewhile(lambda line: not line.startswith("─"), lines))
     if unknown := re.match(r"Unrecognized options: (.*?)(?:, |$)", said):
@@ -93,14 +93,14 @@ REFUSALS = (
     (r"Error parsing (\S+): .* from \[(.*?)\].*'int'", r"\1: got \2, expected a whole number"),
     (r"Error parsing (\S+): .* from \[(.*?)\].*'float'", r"\1: got \2, expected a number"),
 )
-"""Patterns of tyro's messages, and sentences that replace them."""
+"""Regular expressions of tyro's error messages, each with the message that replaces it."""
 
 
 def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:
     """Command line without flags of a scenario's keys, and the values of those keys.
 
-    A key takes one word, a list all words up to the next flag. A boolean takes none: it is written
-    `--control.feedback` or `--control.no-feedback`.
+    The flag of a key is followed by one word; if its value is a list, by all words up to the next
+    flag; if it is a boolean, by none: `--control.feedback`, `--control.no-feedback`.
 
     Args:
         argv: the command line.
@@ -149,7 +149,7 @@ def _key_value(key: str, words: Sequence[str]) -> Any:
 
 
 def _number_or_other(word: str) -> Any:
-    """Value of a text in TOML, or of a number in Python's notation: `1.`, `.5`."""
+    """Value that a text has in TOML; also a number that only Python accepts, as `1.` or `.5`."""
     value = toml_value(word)
     with suppress(ValueError):
         return float(word) if isinstance(value, str) else value
@@ -158,7 +158,7 @@ def _number_or_other(word: str) -> Any:
 
 @cache
 def _kinds(key: str) -> frozenset[Any]:
-    """Types of a key's values, without their arguments; empty if there is no such key."""
+    """Types that a key's value may have, such as `tuple` for a list; empty for an unknown key."""
     kind: Any = Scenario
     for name in key.split("."):
         kind = get_type_hints(kind).get(name) if hasattr(kind, "__struct_fields__") else None
@@ -170,7 +170,7 @@ def _kinds(key: str) -> frozenset[Any]:
 
 
 def toml_value(text: str) -> Any:
-    """Value of a text in TOML if JSON has this value, too; otherwise the text itself."""
+    """Value that a text has in TOML, if JSON can express this value; otherwise the text itself."""
     try:
         table = toml.loads(f"value = {text}")
         return json.loads(json.dumps(table["value"], allow_nan=False)) if len(table) == 1 else text
@@ -179,7 +179,7 @@ def toml_value(text: str) -> Any:
 
 
 def plain(default: T, argv: Sequence[str]) -> T | None:
-    """Options of a command line of simple flags, parsed as by tyro; None if tyro must parse it.
+    """Options of a command line, parsed like tyro if it has simple flags only; None otherwise.
 
     Simple flags are `--flag VALUE`, `--flag=VALUE` and the bare `--flag` of a boolean, after at
     most one positional value. A value is a text, a path, a number or a literal, without a leading
@@ -230,7 +230,7 @@ def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
 
 
 def _value(hint: Any, text: str, *, given: bool) -> Any:
-    """Convert a text to a value of the type `hint`; `given` for `--flag=VALUE`.
+    """Convert a text to the type `hint`; `given`: written as `--flag=VALUE`.
 
     Raises:
         ValueError: only tyro can parse the value.
@@ -247,7 +247,7 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
 
 
 def _tell_tyro(options: type, undo: ExitStack) -> None:
-    """Replace annotations of options by tyro's, without a scenario's keys.
+    """Replace the annotations of options by annotations for tyro; a scenario's keys get none.
 
     Args:
         undo: restores the options' own annotations.

@@ -52,12 +52,12 @@ _loaded: dict[str, Plugin] = {}
 
 
 def named(argv: Sequence[str]) -> list[str]:
-    """Plug-in files on a command line, found before the other arguments are parsed."""
+    """Plug-in files named on a command line; needed before other arguments can be parsed."""
     return flag_values(argv, FLAG)[0]
 
 
 def flag_values(argv: Sequence[str], flag: str) -> tuple[list[str], list[str]]:
-    """Split a command line into values of a flag and other words; a flag without value is kept."""
+    """Split a command line: values of a flag, and other words (a flag without value is a word)."""
     words, values, rest = deque(argv), list[str](), list[str]()
     while words:
         word = words.popleft()
@@ -71,7 +71,7 @@ def flag_values(argv: Sequence[str], flag: str) -> tuple[list[str], list[str]]:
 
 
 def load(paths: Iterable[str] = ()) -> None:
-    """Import plug-ins: those of installed packages (once per process) and files.
+    """Import the plug-ins of installed packages (once per process), and plug-in files.
 
     Raises:
         ConfigError: a plug-in cannot be read or imported, adds nothing, or adds an existing name.
@@ -161,7 +161,7 @@ def _mention_groups(folder: Path) -> bool:
 
 @contextmanager
 def _tables(where: str) -> Iterator[None]:
-    """Restore all tables of names if the block fails, and name the plug-in in the error."""
+    """If the block fails, restore all tables of names, and name the plug-in in the error."""
     before = [dict(table) for table in PLUGIN_TABLES]
     try:
         yield

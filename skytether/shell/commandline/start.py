@@ -1,5 +1,5 @@
-"""Start of every command, before the imports that take seconds. It handles missing standard
-streams, terminals that cannot print Greek letters, and SIGTERM or SIGUSR1 during the imports.
+"""Start of every command, before imports that take seconds. The module handles missing standard
+streams, terminals that cannot print Greek letters, and Ctrl-C or SIGUSR1 during the imports.
 """
 
 import contextlib
@@ -43,9 +43,9 @@ def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
 def begin() -> None:
     """Open missing standard streams, and ignore SIGUSR1 until there are figures to print.
 
-    A closed stream becomes /dev/null, also for children: otherwise the next socket would get its
-    number, and output would go to the socket. Characters that a stream cannot encode are escaped.
-    SIGUSR1 is ignored, also by children, until a handler is set.
+    A closed stream becomes /dev/null, also for child processes: otherwise the next socket would get
+    the stream's descriptor, and output would go to the socket. Characters that a stream cannot
+    encode are escaped. SIGUSR1 is ignored, also by child processes, until a handler is set.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         try:

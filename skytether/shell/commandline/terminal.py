@@ -12,7 +12,7 @@ import msgspec
 from skytether.shared.telemetry.summary import Summary
 from skytether.shell.commandline.command import write
 
-# for type checking only: slow to import, and not needed in flight
+# imported for type checking only, because the import is slow and not needed in flight
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 class Bar(Protocol):
     def __call__(self, done: float, text: str = "") -> None:
-        """Set the progress, in the bar's unit, and a remark."""
+        """Show the progress, in the bar's unit, and a remark beside the bar."""
 
 
 @contextmanager
@@ -110,7 +110,7 @@ COMPARED = (
     ("bytes/s with headers, both ways", "bytes_per_s", ".0f"),
     ("age p99 [ms]", "age_ms_p99", ".0f"),
 )
-"""Name, field and format of the figures that compare flights."""
+"""Rows of a table that compares flights: name, field of `Summary`, and number format."""
 
 
 def finish(
@@ -119,8 +119,8 @@ def finish(
     """Print a summary as a table, and write it to a file.
 
     Args:
-        beside: summaries to compare with; the table then has a column for each flight, with its
-            scenario's name, and fewer rows.
+        beside: summaries of further flights; the table then has one column per flight, named by its
+            scenario, and only the rows of COMPARED.
 
     Raises:
         CommandError: the file cannot be written.

@@ -1,1 +1,1 @@
-"""Drivers of an endpoint in real time: datagrams, streams, changes, and files."""
+"""Drivers of an endpoint in real time: its sockets, changes of keys in flight, and its files."""

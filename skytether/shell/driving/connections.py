@@ -2,8 +2,8 @@
 
 Each connected client gets its own connection to the server. Pieces of data from both go to the
 endpoint as datagrams with the peers `(CLIENT, number)` and `(SERVER, number)`; an empty piece means
-that an end sends no more. An end with HELD_MAX pieces under way is not read, so that TCP slows down
-its sender. If one end resets a connection, the other end is reset at once.
+that the peer has sent its last data. While HELD_MAX pieces of a peer are under way, its socket is
+not read, so that TCP slows it down. If one peer resets its connection, the other's is reset, too.
 """
 
 import asyncio
@@ -18,8 +18,8 @@ from skytether.shell.host.tcp import listen_tcp
 from skytether.shell.host.udp import from_kernel
 
 HELD_MAX = 200
-"""Number of pieces from an end that are under way, above which it is not read. Even with the data
-of one more read, all connections together stay below the bounds of a link's queue."""
+"""Number of a peer's pieces under way at which its socket is no longer read. Even with the data of
+one more read, all connections together stay below the bounds of a link's queue."""
 READ_BYTES = 32 * PIECE_BYTES
 BREAKS_OFF = struct.pack("ii", 1, 0)
 """Value of SO_LINGER (on, 0 s) with which closing a socket sends a reset."""
@@ -28,7 +28,7 @@ Hear = Callable[[bytes, Address], None]
 
 
 class SocketHalf:
-    """One direction of a connection, from a source to a target; `peer` is the source's peer."""
+    """One direction of a relayed connection, from source to target; `peer` names the source."""
 
     def __init__(
         self, source: socket.socket, target: socket.socket, peer: Address, hear: Hear
@@ -84,7 +84,7 @@ class Connections:
         self._server, self._most, self._refused = listen.server, listen.most, refused
         self._hear: Hear = lambda piece, peer: hear(Datagram(piece, peer, 1))
         self._ways: dict[Address, SocketHalf] = {}
-        """Each direction of each connection, by its target's peer."""
+        """Each direction of each connection, by the peer that it leads to."""
         self._running: set[asyncio.Task[None]] = set()
         self._opened = 0
         self._socket = listen_tcp(listen.bind)
@@ -162,4 +162,4 @@ class Connections:
 
 
 open_line = Connections
-"""Function that listens for clients of a `Listen`, see `shell.driving.driver.OpenLine`."""
+"""Function that opens the line of a `Listen`, see `shell.driving.driver.OpenLine`."""

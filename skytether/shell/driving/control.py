@@ -25,7 +25,7 @@ from skytether.shell.host import system
 from skytether.shell.host.local import Local
 
 NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 2)))
-"""Names of the netems of a session's paths, and of the netem to a standby server."""
+"""Names of the netem processes: one for each path of a session, and one to a standby server."""
 PROCESSES = ("server", "server 2", *NETEMS, "client")
 """Names of the processes, and of their sockets in a flight's folder."""
 
@@ -39,7 +39,7 @@ ANSWER_BYTES_MAX = 65_536
 
 
 class ControlError(OSError):
-    """No process answers at the socket; the message has the reason."""
+    """A control socket gave no answer, or a wrong one; the message has the reason."""
 
 
 class Control:
@@ -188,7 +188,7 @@ class Caller:
 
 
 def _answers(sock: socket.socket, path: Path) -> "tempfile.TemporaryDirectory[str]":
-    """Bind a socket to a new address for answers; returns its folder.
+    """Bind a socket to a new address, at which answers arrive; returns the folder of the address.
 
     The address is beside the control socket, because a process in another container may have no
     access to other folders. If it cannot be created there, a temporary folder is used.

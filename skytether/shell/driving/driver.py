@@ -56,14 +56,14 @@ if TYPE_CHECKING:
     AnyLine: TypeAlias = Line | Node | Program | Listen | Callable[..., "OpenLine"]
 
 LINES = {"Line": "stream", "Listen": "connections", "Node": "graph", "Program": "program"}
-"""Module of `shell.driving` that opens a connection beside UDP, by the class that describes it."""
+"""Module of `shell.driving` that opens a line, by the name of the class that describes the line."""
 BURST_MAX = BATCH_MAX
 """Largest number of datagrams read from one socket before timers and other sockets have their
 turn."""
 TOGETHER_MIN = 4
-"""Smallest number of datagrams for a batch call: fewer are faster one by one."""
+"""Smallest number of datagrams for a batch call: single calls are faster for fewer datagrams."""
 CROWD_MIN = 2 * TOGETHER_MIN
-"""Number of datagrams within `patience_ns` above which a socket is read in batches."""
+"""Number of datagrams within `Endpoint.patience_ns` from which a socket is read in batches."""
 BATCHES_MAX = 4
 """Largest number of batches read from one socket before timers and other sockets have their
 turn."""
@@ -73,22 +73,22 @@ CAME = itemgetter(0)
 """Function that returns the arrival time, from a pair of arrival time and datagram."""
 DATAGRAM_BYTES_MAX = 65535
 RESOLVE_EVERY_S = 2.0
-"""Interval at which names are looked up again [s]: a restarted host may have a new address."""
+"""Interval at which host names are resolved again [s]: a restarted host may have a new address."""
 CHECK_PATHS_EVERY_S = 1.0
 Numbers = dict[Address, Address]
 """Numeric address of each peer, by its address as the user gave it."""
 
 
 class OpenLine(Protocol):
-    """Connection beside the UDP sockets.
+    """Line: connection of another kind than the UDP sockets of a `Shell`.
 
-    The module in LINES has `open_line(line, hear, refused) -> OpenLine`: `hear` is called with
+    Each module in LINES has `open_line(line, hear, refused) -> OpenLine`: `hear` is called with
     datagrams that arrive together, `refused` with the reason why a sent datagram cannot arrive.
     """
 
     @property
     def address(self) -> Address | None:
-        """Address for incoming connections; None without any."""
+        """Address at which the line accepts connections; None if the line accepts none."""
 
     def send(self, payload: bytes, peer: Address) -> bool:
         """Send bytes to a peer; False if they cannot be sent now."""
@@ -120,10 +120,10 @@ class Shell:
     Args:
         bind: address of socket 0 (port 0 takes a free one), or a bound socket; or a list for
             sockets 0, 1 and so on. Further sockets are opened when the endpoint sends from them.
-        peers: addresses that the endpoint will send to, names or numbers; the endpoint sees them as
-            written here, not in the kernel's form.
+        peers: addresses that the endpoint will send to, with host names or numbers. The endpoint
+            sees the addresses as written here, not as the kernel returns them.
         stopwatch: measures receiving and sending.
-        forms: forms of the datagrams accepted at the bound sockets; empty accepts all.
+        forms: forms that datagrams at the bound sockets must have; empty to accept all datagrams.
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
         line: connection to an autopilot, a robot, a program's packets or relayed clients, which
@@ -187,7 +187,7 @@ class Shell:
                 self._add(line)
             failed.pop_all()
         self._buffer = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """Buffer for all datagrams: copying from it is faster than allocating one per datagram."""
+        """Buffer into which all datagrams are read; faster than allocating one per datagram."""
         self._batches: dict[int, DatagramBatch | None] = {}
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}
@@ -364,11 +364,11 @@ class Shell:
             self._after()
 
     def _read_slice(self) -> None:
-        """Read what has arrived at the sockets that are read in batches, with at most BATCHES_MAX
-        calls each.
+        """Read the datagrams at each socket that is read in batches, in at most BATCHES_MAX calls
+        per socket.
 
-        Handling many datagrams in a row takes half the time of waking the process for each, when
-        caches are cold. The kernel's timestamps give their arrival times.
+        Waking the process for each datagram, with cold caches, would take twice the time. The
+        kernel's timestamps give the arrival times.
         """
         is_left, nothing_came = False, list[int]()
         came: list[tuple[int, Datagram]] = []
@@ -408,19 +408,19 @@ class Shell:
     def _read_batch(
         self, number: int, batch: DatagramBatch, last_ns: int
     ) -> list[tuple[int, Datagram]]:
-        """Datagrams that one call reads from a socket, each with its arrival time [ns], in rising
-        order.
+        """Datagrams that one call reads from a socket, each with its arrival time [ns], in order of
+        arrival.
 
         Args:
-            last_ns: arrival time of the datagram before them [ns].
+            last_ns: arrival time of the datagram read last [ns].
         """
         self._stopwatch.start()
         payloads, raws, came_ns = batch.receive(self._sockets[number])
         if not payloads:
             return []
         self._count(number, len(payloads))
-        # Timestamps may be wrong: CLOCK_REALTIME may be set, and a socket's first datagrams have
-        # the time of reading. But datagrams are read in the order of arrival.
+        # Timestamps can be wrong: CLOCK_REALTIME may be set, and a socket's first datagrams get the
+        # time of reading. Times must not fall: datagrams are read in order of arrival.
         now_ns = time.monotonic_ns()
         stamps_ns = [last_ns := min(max(stamp_ns, last_ns), now_ns) for stamp_ns in came_ns]
         try:
@@ -464,13 +464,13 @@ class Shell:
             self._after()
 
     def leave(self) -> int:
-        """Ask the endpoint to end; returns the time at which to end it if it has not [ns]."""
+        """Ask the endpoint to end; returns the time at which it must be ended by force [ns]."""
         latest_ns = self.endpoint.leave(now_ns=time.monotonic_ns())
         self._after()
         return latest_ns
 
     def changed(self) -> None:
-        """Send the datagrams and report the events that a change of the endpoint caused."""
+        """After a change of the endpoint's keys, send its datagrams and report its events."""
         self._heard_ns = time.monotonic_ns()
         self._after()
 
@@ -506,8 +506,8 @@ class Shell:
             for first in range(0, len(same), BURST_MAX):
                 row = same[first : first + BURST_MAX]
                 sent = self._send_together(row) if len(row) > 1 else 0
-                # The rest is sent one by one; here a datagram that failed in the batch raises its
-                # error.
+                # The rest is sent one by one, so that a datagram that failed in the batch raises
+                # its own error.
                 for datagram in row[sent:]:
                     self._send(datagram)
 
@@ -552,8 +552,8 @@ class Shell:
         while any(names.may_change for names in all_names):
             await asyncio.sleep(RESOLVE_EVERY_S)
             addresses: asyncio.Future[list[Numbers]] = self._loop.create_future()
-            # A thread, not an executor: at its end the loop waits for executors, and a lookup may
-            # take 20 s.
+            # A thread, because the event loop would wait at its end for a lookup in an executor, up
+            # to 20 s.
             work = all_names, addresses
             threading.Thread(target=self._look_up, args=work, daemon=True).start()
             self._learn(all_names, await addresses)
@@ -625,7 +625,7 @@ def run(
         on_event: called with each event of an endpoint, and with each exception of its code.
         on_usr1: called at SIGUSR1.
         on_second: called about once a second.
-        on_signal: called at signals for another process, in place of this process's handling.
+        on_signal: called with a signal's number, in place of own handling, to pass it on.
     """
     # Without `freeze`, garbage collection would scan all imported objects, which takes 13 ms.
     gc.collect()

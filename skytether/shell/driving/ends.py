@@ -1,6 +1,6 @@
-"""Recorder of the packets at an end (`shared.telemetry.ends`): an endpoint round the process's.
+"""Recorder of the packets at an endpoint (`shared.telemetry.ends`): an endpoint that wraps it.
 
-A process without a feed does without it.
+Only processes with a feed use the recorder.
 """
 
 import time
@@ -16,7 +16,7 @@ from skytether.shared.wire.framing import split
 from skytether.shared.wire.protocol import kind_of
 
 PEERS_MAX = 1024
-"""Largest number of addresses that are told apart; further ones share a number."""
+"""Largest number of addresses with their own number in the record; all others share a number."""
 
 
 class Watched(Steady):

@@ -1,8 +1,8 @@
 """Feed: socket through which a process sends rows and events to readers without waiting.
 
-The feed runs in the process's own event loop and never blocks: bytes for a slow reader are queued,
-up to a bound, and a reader whose queue is full is dropped. `shared.telemetry.feed` defines the
-frames; `Subscriber` is the other end.
+The feed runs in the process's own event loop and never blocks: bytes for a slow reader are queued
+up to a bound; a reader whose queue is full is disconnected. `shared.telemetry.feed` defines the
+frames; `Subscriber` reads them.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ WAITING_BYTES_MAX = 4 * 1024 * 1024
 BACKLOG_BYTES_MAX = 1024 * 1024
 """Largest number of bytes of sent frames that are kept for readers that connect later."""
 ROWS_BYTES_MAX = 256 * 1024
-"""Size of rows at which a frame is full [B]."""
+"""Size of the rows in a frame from which the next rows go into a new frame [B]."""
 SEND_BYTES_MAX = 64 * 1024
 """Largest number of bytes sent to a reader in one turn of the loop."""
 GATHER_S = 0.01
@@ -51,13 +51,13 @@ PATIENCE_S = 0.5
 
 READ_BYTES = 256 * 1024
 AGAIN_S = 1.0
-"""Time between two attempts to connect to a process, or two searches for new feeds [s]."""
+"""Time between two attempts to connect to a process, and between searches for new feeds [s]."""
 FOLLOWED_MAX = 128
 """Largest number of feeds that a subscriber follows."""
 
 
 class _Part:
-    """Rows of one part of the record that were written, but are not in a frame yet."""
+    """Rows of one part of the record, as they wait to be put into a frame."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -139,7 +139,7 @@ class Feed:
         self._listen()
 
     def take(self) -> None:
-        """Put rows that were recorded since the last call into frames."""
+        """Make frames from the rows that were recorded since the last call."""
         for part in self._parts:
             if part.rows:
                 for frame in part.frames(time.monotonic_ns()):
@@ -263,7 +263,7 @@ class Subscriber:
         take: called in the thread with the process name and each frame; a feed begins with
             `Opened`.
         lost: called in the thread with the process name when a feed has ended.
-        further: returns the sockets of new feeds; called at intervals.
+        further: called every AGAIN_S; returns the feeds' sockets at that time, by process name.
     """
 
     def __init__(

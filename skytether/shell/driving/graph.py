@@ -1,8 +1,8 @@
 """Node of the ROS graph on a Zenoh network, beside the sockets of a `Shell`.
 
 Zenoh has its own sockets and threads. Its threads only put received messages into a queue; the
-event loop passes them to the endpoint, as datagrams whose peers are topics. Zenoh itself reconnects
-to a lost router.
+event loop passes them to the endpoint as datagrams with the topic's name as the peer's host. Zenoh
+itself reconnects to a lost router.
 """
 
 import asyncio
@@ -20,7 +20,7 @@ from skytether.shell.host.udp import AddressError
 QUEUE_MAX = 256
 """Largest number of messages waiting for the event loop; the oldest are dropped."""
 MESSAGE_BYTES_MAX = 65_535
-"""Size above which a message is ignored [B]: no datagram is larger."""
+"""Size above which a message is ignored [B]: the largest size of a datagram."""
 
 
 class GraphSession:
@@ -83,7 +83,7 @@ class GraphSession:
         remote = zenoh.Locality.REMOTE
         return [
             session.declare_subscriber(into.key(node.domain), put(into.name)),
-            # Commands by others, of any type: they show that somebody else steers the robot.
+            # Commands of other nodes, of any type: they show that another node steers the robot.
             session.declare_subscriber(
                 f"{node.domain}/{out.name.strip('/')}/*/*", put(out.name), allowed_origin=remote
             ),
@@ -94,7 +94,7 @@ class GraphSession:
     def _publish(self, form: int) -> None:
         """Publish the topic with one of its types, in place of the earlier type."""
         node, session = self._node, self._session
-        # Commands are dropped without a connection, because later they would be stale.
+        # Commands without a connection are dropped, because they would be stale later.
         self._publisher = session.declare_publisher(
             node.forms[form].key(node.domain),
             congestion_control=self._zenoh.CongestionControl.DROP,

@@ -4,7 +4,7 @@ ARG…`.
 It makes namespaces of network, mounts and processes, and in them a first process with number 1.
 Process 1 opens the only network device, sends it to netem through the socket FD, and runs the
 program. When process 1 ends, the kernel ends all processes of the namespaces, network and device.
-Process 1 ends when the socket closes, even if a process was killed.
+Process 1 ends when the socket closes, also because netem was killed.
 
 It imports few modules of the package, because it is started with each program.
 """
@@ -29,7 +29,7 @@ from skytether.shell.host import system
 
 READY, START, ENDED, ALL_ENDED = b"ready", b"start", b"ended", b"all ended"
 """Messages: ready, with the device; start the program; the program has ended, with its wait status;
-all its processes have ended. Other messages to netem are errors, and from netem numbers of signals.
+all its processes have ended. Other messages are errors (to netem) or signal numbers (from netem).
 """
 LINGER_S = 10.0
 """Longest time for connections closed by the program to send their remaining data [s]."""
@@ -59,7 +59,7 @@ def main(argv: Sequence[str]) -> int:
     control, mtu, command = socket.socket(fileno=int(argv[0])), int(argv[1]), argv[2:]
     control.set_inheritable(False)
     _end_with_parent()
-    # Process 1 passes on signals that only netem has received, see `_pass_on`.
+    # Signals are blocked, so that `_pass_on` sees which signals this process has received itself.
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
     try:
         _enter()
@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _end_with_parent() -> None:
-    """Let the kernel kill this process when its parent ends, until credentials change."""
+    """Let the kernel kill this process when its parent ends, until its credentials change."""
     _call(_libc.prctl, _PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
@@ -120,7 +120,7 @@ def _enter() -> None:
     """Enter new namespaces; an ordinary user becomes the same user of a user namespace.
 
     Raises:
-        OSError: the kernel, or a container, does not allow it.
+        OSError: the kernel, or a container, does not allow new namespaces.
     """
     uid, gid = os.geteuid(), os.getegid()
     flags = _NEWNET | _NEWNS | _NEWPID
@@ -138,7 +138,7 @@ def _open_device() -> int:
 
 
 def _configure(mtu: int) -> None:
-    """Bring the device up; it gets no link-local address, so that the kernel sends no packet."""
+    """Bring the device up without a link-local address, so that the kernel sends no packets."""
     with _handing_down():
         _ip(
             "link set lo up",
@@ -161,7 +161,7 @@ def _configure(mtu: int) -> None:
 
 @contextmanager
 def _handing_down() -> Iterator[None]:
-    """Let `ip` administer the network, which programs of ordinary users may not do."""
+    """In the block, let `ip` configure the network, even if an ordinary user has started netem."""
     header, own = struct.pack("Ii", _CAPABILITY_VERSION_3, 0), ctypes.create_string_buffer(24)
     _call(_libc.capget, header, own)
     effective, permitted, inheritable, *others = struct.unpack("6I", own.raw)
@@ -182,7 +182,7 @@ def _ip(*lines: str) -> None:
 
 
 def _mount() -> None:
-    """Mount a /proc of the program's processes, and a resolv.conf with slirp's resolver."""
+    """Mount a /proc of the program's processes, and a resolv.conf with slirp4netns's resolver."""
     _call(_libc.mount, b"none", b"/", None, _MS_REC | _MS_PRIVATE, None)
     with suppress(OSError):  # a container may hide parts of /proc, which then stays unchanged
         _call(_libc.mount, b"proc", b"/proc", b"proc", 0, None)
@@ -193,11 +193,11 @@ def _mount() -> None:
     for folder in filter(os.path.isdir, RESOLVERS):
         _call(_libc.mount, b"tmpfs", folder.encode(), b"tmpfs", 0, None)
     real = path.resolve()
-    if not real.exists():  # a machine without this file resolves no names
+    if not real.exists():  # nothing to mount over: this machine resolves no names
         if str(real.parent) in RESOLVERS:  # a private folder since the mount above
             real.write_text(text)
         return
-    if text == before:  # inside another `netem run`; its deleted file cannot be mounted over
+    if text == before:  # within another `netem run`: a file that cannot be mounted over
         return
     with tempfile.NamedTemporaryFile("w") as file:  # the file is deleted, its mount remains
         file.write(text)
@@ -219,7 +219,7 @@ def _run(command: Sequence[str], mask: Iterable[int]) -> None:
 
 
 def _wait(control: socket.socket, program: int) -> None:
-    """Wait for the program, then for all processes that it left running; report each end."""
+    """Tell netem when the program has ended, and when all processes that it started have ended."""
     woken, wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
     signal.set_wakeup_fd(wake)
     signal.signal(signal.SIGCHLD, lambda *_: None)
@@ -256,8 +256,8 @@ def _wait(control: socket.socket, program: int) -> None:
 def _pass_on(number: int, program: int) -> None:
     """Send the program a signal that netem received, unless the program has received it itself.
 
-    A terminal, or `kill` of a process group, sends a signal to both, and to this process, where it
-    is blocked and pending.
+    A terminal, or `kill` of a process group, sends a signal to netem, to the program and to this
+    process, where the signal is blocked and therefore pending.
     """
     if signal.sigtimedwait([number], 0) is None:
         os.kill(program, number)

@@ -3,10 +3,10 @@
     MAGIC | digest of the rest, with the vehicle's key | host, time and identity | content
 
 A thread writes a new file and renames it, so that no step waits for a disk and the file is always
-complete. If writing fails while the endpoint waits for it, the file is removed: the next run must
-not use old state, and the endpoint goes on. If it cannot be removed either, on a read-only disk,
-the next run refuses it. It also refuses a damaged file, or one of another vehicle, key or flight.
-The file need not survive a reboot, which takes longer than any motion.
+complete. If a write fails while the endpoint waits for it, the file is removed, so that the next
+run uses no old state, and the endpoint goes on. A file that cannot be removed either, on a
+read-only disk, is refused by the next run, as are a damaged file and a file of another vehicle, key
+or flight. The file need not survive a reboot, because a reboot takes longer than any motion.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ FILE_BYTES_MAX = 65_536
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
 DISK_FAILED = {EROFS, EIO}
-"""Errors of a failed disk; a full disk counts as usable, because the lock file fits."""
+"""Errors of a failed disk. A full disk is not a failed disk: the empty lock file still fits."""
 AGAIN_S = 1.0
 """Time after which a failed write is repeated [s]."""
 
@@ -56,7 +56,7 @@ def folder(given: str) -> Path:
 
     Args:
         given: key `vehicle.memory`: a path, or "auto" for the state folder of the systemd service,
-            otherwise the user's.
+            or of the user without a service.
     """
     if given != "auto":
         return Path(given).expanduser()
@@ -76,8 +76,8 @@ class MemoryFile:
         secret: key of the vehicle, which authenticates the file; empty without keys.
 
     Raises:
-        OSError: the folder cannot be created, or another process uses this file. On a failed disk
-            neither is an error: the flight goes on, and `news` reports what is not saved.
+        OSError: the folder cannot be created, or another process uses this file. A failed disk
+            raises no error: the flight goes on, and `news` reports that nothing is saved.
     """
 
     def __init__(self, path: Path, identity: Mapping[str, str], secret: bytes = b"") -> None:
@@ -94,11 +94,11 @@ class MemoryFile:
         self._ends = False
         self._thread: threading.Thread | None = None
         self._failure = self._reported = ""
-        """Reason why the newest content was not written, and reason reported last, or ""."""
+        """Why the newest content is not written, and the reason last reported; "" for none."""
         self._is_removed = False
         """Whether the file was removed, because it could not be written."""
         self._kept_nothing = False
-        """Whether the endpoint was last informed that no state is saved."""
+        """Whether the newest information of the endpoint is that no state is saved."""
 
     @property
     def path(self) -> Path:

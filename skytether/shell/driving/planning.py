@@ -1,9 +1,9 @@
 """Planners of plug-ins in real time: each call in a thread, with a time limit.
 
-If a planner takes too long, the tick continues without it: its late plan is dropped, and before
-that it is not called again. So a planner that hangs delays other vehicles' plans once, by the
-limit, and no tick is missed. Threads cannot be ended; they end with the process. So once
-HANGING_MAX calls hang, also of vehicles that have left, no further call is started.
+If a planner takes too long, the tick continues without its plan. The planner is not called again
+before its call ends, and the late plan is dropped. So a planner that hangs delays other vehicles'
+plans once, by the limit, and no tick is missed. As threads cannot be ended, no further call is
+started once HANGING_MAX calls hang, including calls for vehicles that have left.
 """
 
 import time
@@ -13,9 +13,9 @@ from threading import Thread
 from typing import Any
 
 SHARE = 0.5
-"""Share of a step for which a tick waits for planners; the next tick must be in time."""
+"""Share of a step for which a tick waits for planners, so that the next tick is in time."""
 HANGING_MAX = 64
-"""Largest number of unfinished calls of earlier ticks with which new calls are started."""
+"""Number of unfinished calls of earlier ticks from which no new call is started."""
 
 Call = Callable[[], Any]
 Calls = SimpleQueue[tuple[int, int, Call]]

@@ -51,11 +51,11 @@ kills it when netem ends. Only netem and the guard have the two ends of the scri
 so each sees when the other has ended. `--exit-fd` would have no effect before netem connects."""
 FRAME_BYTES_MAX = 65_536
 WAITING_MAX = 16_384
-"""Largest number of packets waiting for slirp4netns; further packets are send errors."""
+"""Largest number of packets waiting for slirp4netns; further packets count as send errors."""
 PATIENCE_S = 30.0
 """Longest time for slirp4netns to start [s]."""
 GRACE_S = 1.0
-"""Time from SIGHUP until the program is killed, after netem's parent has ended [s]."""
+"""Time between SIGHUP and SIGKILL for the program after netem's parent has ended [s]."""
 FLUSH_S = 1.0
 """Longest time at the end for slirp4netns to read the last packets [s]."""
 
@@ -85,7 +85,7 @@ class Program:
         self.control.send(START)
 
     def signal(self, number: int) -> None:
-        """Pass a signal on to the program; if it has ended, end its other processes."""
+        """Pass a signal on to the program; after its end, end the processes that it has left."""
         with suppress(OSError):
             self.control.send(bytes([number]))
         if number == signal.SIGTSTP:  # the shell waits until netem has stopped, too
@@ -101,7 +101,7 @@ def program(
     Args:
         mtu: MTU of its device [B].
         path_mtu: largest packet that slirp4netns sends to the program [B].
-        exposed: addresses on this machine; TCP and UDP to them go to the program's same port.
+        exposed: addresses on this machine; TCP and UDP to them go to the same port of the program.
 
     Raises:
         ProgramError: something is missing, or an address cannot be exposed.
@@ -114,7 +114,7 @@ def program(
         outside, guard = stack.enter_context(_slirp(path_mtu, exposed))
         control, inner = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         inner.set_inheritable(True)
-        # Passes on file descriptors that a shell has opened for the program, as in `<(command)`.
+        # Files that a shell has opened for the program, as in `<(command)`, are passed on.
         start = [sys.executable, "-P", "-m", "skytether.shell.driving.inside"]
         start += [str(inner.fileno()), str(mtu), *command]
         inside = subprocess.Popen(start, close_fds=False)
@@ -250,7 +250,7 @@ class ProgramLine:
         self._buffer = memoryview(bytearray(FRAME_BYTES_MAX))
 
     def send(self, payload: bytes, peer: Address) -> bool:
-        """Send a packet; False if it is invalid, or too many wait."""
+        """Send a packet; False if the packet is invalid, or too many packets wait."""
         try:
             if peer == PROGRAM:
                 return os.write(self._program.device, payload) == len(payload)

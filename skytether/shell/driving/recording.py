@@ -55,7 +55,7 @@ class RecordFile:
         self._ended = True
 
     def fault(self) -> str | None:
-        """Sentence about missing rows; None if complete; valid after `end`."""
+        """Error message about rows missing in the file; None without any. Valid after `end`."""
         reason = self._reason()
         if reason is None:
             return None

@@ -27,7 +27,7 @@ class ByteStream:
         hear: called with the bytes of each read, from the peer `LINE`.
 
     Raises:
-        AddressError: the system has no serial ports, or not this rate.
+        AddressError: the system has no serial ports, or does not support this bit rate.
     """
 
     address = None

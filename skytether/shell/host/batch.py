@@ -26,15 +26,15 @@ from skytether.shared.base.units import SECOND_NS
 
 BATCH_MAX = 128
 NEAR_NS, READINGS = 5_000, 4
-"""Longest time between two readings of clocks that count as simultaneous [ns], and attempts."""
+"""Longest time between two clock readings that count as simultaneous [ns]; number of attempts."""
 SIZE_MAX = 2048
 """Largest payload that `DatagramBatch.send` takes [B]; packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
-"""Largest number of datagrams sent as one; older kernels refuse more."""
+"""Largest number of datagrams sent as one long datagram; older kernels refuse more."""
 SEGMENTED_BYTES_MAX = 65_000
 """Largest total payload of the datagrams that are sent as one [B]; IP allows a little more."""
 SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
-"""Largest payload of a datagram that is sent together with another as one [B]."""
+"""Largest payload with which two datagrams fit into one long datagram [B]."""
 
 _STRIDE = 65_536 + 4096 + 64
 """Distance of two receive buffers [B]: the longest datagram plus an odd number of cache lines, so
@@ -165,7 +165,7 @@ class DatagramBatch:
         sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
 
     def receive(self, sock: socket.socket) -> tuple[list[bytes], list[RawAddress], list[int]]:
-        """Payloads and senders of the datagrams that have arrived, at most BATCH_MAX.
+        """Receive the datagrams that have arrived, at most BATCH_MAX.
 
         Args:
             sock: socket of this family, prepared by `stamp`.
@@ -173,7 +173,7 @@ class DatagramBatch:
         Returns:
             payloads, senders, and arrival times [ns; CLOCK_MONOTONIC], in the order of arrival; all
             empty if there was no datagram, or an error. Arrival times are converted from the
-            kernel's time of day, so they are wrong by the step when that clock is set; a datagram
+            kernel's time of day, so a step of that clock makes them wrong by its size. A datagram
             without an arrival time gets the present time.
         """
         rows, size = self._in, self._name_bytes
@@ -225,7 +225,7 @@ class Segments:
         """
 
     def suits(self, payloads: Sequence[bytes]) -> bool:
-        """Whether segmentation needs fewer calls for payloads in this order."""
+        """Whether segmentation is faster than single calls for payloads in this order."""
         sizes = list(map(len, payloads))
         if not 0 < min(sizes) <= max(sizes) <= self.size_max:
             return False

@@ -1,9 +1,9 @@
 """Compilation of kernels, with one process per core.
 
 Numba compiles one function at a time in a process. So other processes compile beside this one,
-which then reads the machine code that they stored on disk. Each takes the next kernel from a
-queue, because compile times are not known beforehand. A second command waits for the first, which
-also compiles kernels for the second.
+which then reads the machine code that they stored on disk. Each process takes the next kernel from
+a queue, because compile times are not known beforehand. A second command waits for the first, and
+loads what the first has compiled.
 """
 
 import subprocess
@@ -69,7 +69,7 @@ PROGRESS_BYTES = 200
 
 
 def tell(folder: Path | None, text: str) -> None:
-    """Write the text that `progress` reads to a flight's folder, if any; empty: remove the file."""
+    """Write the text that `progress` returns into a flight's folder; an empty text removes it."""
     if folder is None:
         return
     with suppress(OSError):
@@ -81,7 +81,7 @@ def tell(folder: Path | None, text: str) -> None:
 
 
 def progress(folder: Path | None) -> str:
-    """Text about a command's compilation; empty if there is none, or once it has ended."""
+    """Progress of the compilation of kernels, as text; empty while nothing is compiled."""
     with suppress(OSError, ValueError):
         return input_files.read(folder / PROGRESS, PROGRESS_BYTES).decode() if folder else ""
     return ""

@@ -29,7 +29,7 @@ class Limit:
     def admit(self, event: Event, *, now_ns: int) -> Sequence[Event]:
         """Events to log now: `Omitted` counts of past seconds, and this event if within the limit.
 
-        An `Omitted` event is not returned; its count is added to that of its kind.
+        An `Omitted` event is not returned: its count is added to the omitted events of its kind.
         """
         kind = event.kind if isinstance(event, Omitted) else type(event).__name__
         over = self.omitted(kind, now_ns=now_ns)

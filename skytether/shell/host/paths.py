@@ -54,10 +54,10 @@ def parse_path(text: str) -> NetworkPath | None:
 
 
 class PathSockets:
-    """Opener of one path's sockets, one after the other.
+    """Opens the socket of one path, and a new socket when the old one no longer works.
 
     Args:
-        is_patient: see `Names`.
+        is_patient: whether the peer's name may be resolved later, see `Names`.
 
     Raises:
         AddressError: the peer's name cannot be resolved, or has another address family than LOCAL.
@@ -78,7 +78,7 @@ class PathSockets:
 
     @property
     def is_local(self) -> bool:
-        """Whether both ends are on this machine, so far as addresses are known."""
+        """Whether both ends are on this machine; False while the peer's address is unknown."""
         addresses = [self._bind, *self.names.numbers()]
         return not self.names.missing and all(map(is_loopback, addresses))
 
@@ -108,7 +108,7 @@ class PathSockets:
         return self._index != self._index_now()
 
     def _index_now(self) -> int:
-        """Number of the interface in the kernel; 0 if there is none."""
+        """Kernel's index of the path's interface; 0 without an interface, or if it is missing."""
         try:
             return socket.if_nametoindex(self._interface) if self._interface else 0
         except OSError:

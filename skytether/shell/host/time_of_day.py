@@ -1,9 +1,9 @@
 """Time of day of this host, with the error bound that its kernel reports (`adjtimex`, Linux).
 
 The time daemon sets that bound. chrony and ntpd include half of the round-trip time to their
-source, so it holds whatever the network delay. systemd-timesyncd sets it to 0, which is not an
-estimate: such a clock counts as unknown. Chrony without `rtcsync` leaves the clock marked as not
-synchronised, which also counts as unknown.
+source, so their bound holds for any network delay. systemd-timesyncd reports an error of 0, which
+is not an estimate: the time then counts as unknown. Chrony without `rtcsync` leaves the clock
+marked as not synchronised, which also counts as unknown.
 """
 
 import ctypes
@@ -21,7 +21,7 @@ UNSYNCHRONISED, CLOCK_ERROR = 0x40, 5
 
 
 class _Timex(ctypes.Structure):
-    """First fields of the kernel's `struct timex`; the rest of it is padding."""
+    """First fields of the kernel's `struct timex`; `rest` has space for its other fields."""
 
     _fields_ = (
         ("modes", ctypes.c_uint),
@@ -64,8 +64,8 @@ def host_time() -> HostTime | None:
     error_ns = stated(answer, timex.status, timex.maxerror, timex.esterror)
     if error_ns is None:
         return None
-    # The process may be preempted between two clocks: the monotonic one is read before and after,
-    # and the time between counts as an error.
+    # The process may be preempted between two readings, so CLOCK_MONOTONIC is read before and after
+    # the time of day, and the time between is added to the error.
     before_ns, utc_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
     return HostTime(utc_ns, error_ns + after_ns - before_ns, after_ns)
 

@@ -60,7 +60,7 @@ class KernelTimer:
         try:
             os.read(self._fd, 8)
         except BlockingIOError:
-            return  # set again between the poll and this call
+            return  # the timer was set again between the poll and this call
         self._callback()
 
     def set(self, due_ns: int | None) -> None:

@@ -26,8 +26,8 @@ FLOODED_BYTES = 16 * 1024 * 1024
 """Receive buffer of a socket that may be flooded [B]: half a second of 50 000 packets/s."""
 
 ADDRESSES_MAX = 4096
-"""Largest number of addresses of which the user's and the kernel's form are cached, 360 B each;
-bounded, because a flood of HELLO packets may fill the cache."""
+"""Largest number of cached addresses, each in the user's and the kernel's form (360 B); bounded,
+because a flood of HELLO packets may fill the cache."""
 
 SPARE_FILES = 48
 """Number of open files that a process may need beside its sockets, for feed and metrics."""
@@ -50,7 +50,7 @@ class AddressError(OSError):
 
 
 def within_reach_of(peers: Iterable[Address]) -> Address:
-    """Address for binding a socket: a free port, on loopback if all peers are on loopback.
+    """Address to bind a socket to, with port 0: loopback if all peers are on loopback, else any.
 
     Args:
         peers: numeric addresses of one family; without any, IPv4 is assumed.
@@ -190,8 +190,8 @@ def admit_only(sock: socket.socket, forms: Sequence[Form]) -> None:
 
     Args:
         sock: a UDP socket.
-        forms: accepted forms, the most frequent first; a datagram shorter than the head of a form
-            before its own is dropped.
+        forms: accepted forms, the most frequent first. The kernel also drops a datagram that is
+            shorter than the head of any form listed before its own.
     """
     _make_room(sock, socket.SO_RCVBUF, _SO_RCVBUFFORCE, FLOODED_BYTES)
     if sys.platform != "linux":
@@ -232,7 +232,7 @@ def refusals(sock: socket.socket) -> Iterator[str]:
         except OSError:  # no more errors
             return
         for _, kind, error in news:
-            # Local errors were raised when the datagram was sent.
+            # Errors of this machine are skipped: sending the datagram has raised them already.
             if kind in (_IP_RECVERR, _IPV6_RECVERR) and error[4] != _FROM_THIS_MACHINE:
                 yield os.strerror(int.from_bytes(error[:4], sys.byteorder))
 
@@ -240,7 +240,7 @@ def refusals(sock: socket.socket) -> Iterator[str]:
 def kernel_drops(sock: socket.socket) -> int:
     """Number of datagrams that the kernel dropped; 0 if the system does not report it.
 
-    It drops datagrams if the receive buffer is full, or if they have none of the admitted forms.
+    The kernel drops datagrams if the receive buffer is full, or if no form admits them.
     """
     try:
         info = sock.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, 4 * (_MEMINFO_DROPS + 1))
@@ -406,7 +406,7 @@ def look_up(peer: Address, family: int = socket.AF_UNSPEC) -> Address:
     """Numeric address of a name or number, IPv4 if a name has addresses of both families; blocks.
 
     Raises:
-        OSError: it cannot be resolved.
+        OSError: the name cannot be resolved.
     """
     entries = socket.getaddrinfo(*peer, family=family, type=socket.SOCK_DGRAM)
     four = [entry for entry in entries if entry[0] == socket.AF_INET]

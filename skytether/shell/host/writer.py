@@ -29,7 +29,7 @@ class Writer:
         self._capacity = capacity
         self._together = together
         self._pause_s = pause_s
-        # Each counter is changed by one thread: `offered` and `refused` by the caller's.
+        # The caller's thread changes `offered` and `refused`; the writer's, the other counters.
         self.offered = 0
         self.refused = 0
         """Number of bytes that were dropped because too many were waiting."""

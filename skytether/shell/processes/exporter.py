@@ -54,9 +54,9 @@ class Collected(Collector):
     """Collector of the newest figures of a process.
 
     Args:
-        process: server, netem or client; `server.N` is worker N of a server, `netem N` that of
+        process: server, netem or client; `server.N` is worker N of a server, `netem N` is netem of
             path N.
-        table: metrics of the figures, for a process of which `metrics` has no table.
+        table: metrics of the figures, for a process without a table in `metrics`.
     """
 
     def __init__(
@@ -65,7 +65,7 @@ class Collected(Collector):
         self._process = process
         self._kind = process.partition(" ")[0].partition(".")[0]
         self._scenario, self._step_s, self._table = scenario, step_s, table
-        # Replaced as a whole, so that threads see either the old or the new figures.
+        # The snapshot is replaced as a whole: threads see either the old or the new figures.
         self._snapshot: tuple[Mapping[str, Any], float] | None = None
 
     def take(self, figures: Mapping[str, Any]) -> None:
@@ -225,7 +225,7 @@ def _listening(address: Address) -> socket.socket:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
         sock = socket.create_server((host, port), family=family, backlog=CONNECTIONS_MAX)
     except OSError as error:
-        # The text of an OSError contains the address, that of a gaierror does not.
+        # The text of an OSError contains the address, so only a gaierror's own text is used.
         number = error.errno or 0
         raise MetricsError(os.strerror(number) if number > 0 else str(error.strerror)) from None
     return sock

@@ -34,7 +34,7 @@ LogFormat = Literal["text", "json"]
 
 class LogLine(msgspec.Struct, frozen=True, kw_only=True):
     process: str
-    """Name: server, netem or client; `server.N` is worker N of a server, `netem N` path N's."""
+    """Name: server, netem or client; `server.N`: a server's worker N; `netem N`: path N's netem."""
     time_ns: int
     """Time of the event [ns; CLOCK_MONOTONIC]."""
     event: EveryEvent
@@ -45,9 +45,7 @@ _UNDECODABLE = msgspec.DecodeError, UnicodeDecodeError, RecursionError
 
 
 def line_of(text: bytes) -> LogLine | None:
-    """Parse a printed line; None if it is not a line of the log, but for example one of a
-    traceback.
-    """
+    """Parse a printed line; None for other text, such as a line of a traceback."""
     try:
         return _DECODER.decode(text)
     except _UNDECODABLE:

@@ -19,12 +19,12 @@ class Metric(NamedTuple):
     """Metric and the figure that it exports."""
 
     figure: str
-    """Path of the figure: names of its groups and its own, with slashes between them. `{label}`
-    matches any name, which becomes the value of that label.
+    """Path of the figure: the names of its groups, then its own name, separated by slashes.
+    `{label}` matches any name, which becomes the value of that label.
     """
     name: str
     labels: Mapping[str, str]
-    """Fixed labels, which separate figures of the same metric."""
+    """Labels with fixed values, which distinguish the figures that this metric combines."""
     help: str
 
     @property
@@ -359,7 +359,7 @@ def flat(
 
 
 def matched(figure: str, path: tuple[str, ...]) -> dict[str, str] | None:
-    """Labels of a figure with this path; None where the metric's path does not match."""
+    """Labels that a metric's path takes from a figure's path; None if the paths do not match."""
     pattern = figure.split("/")
     if len(pattern) != len(path):
         return None

@@ -63,7 +63,7 @@ class ProcessOptions(ScenarioOptions):
     """Unix socket to create, through which keys change in flight, see `skytether set`."""
     new_flight: bool = False
     """Begin a new flight: discard values that were set in an earlier run, which are stored beside
-    the socket of --control. Give it by hand; never put it into the command of a service.
+    the socket of --control. Give this flag by hand; never put it into the command of a service.
     """
     feed: Path | None = None
     """Unix socket to create, at which other programs read the rows and events of this process."""
@@ -125,7 +125,7 @@ class Process:
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
     def _watched(self, endpoint: Endpoint, line: int | None) -> Endpoint:
-        """The endpoint, with the packets at this end recorded in the feed, if there is one."""
+        """The endpoint, wrapped to record its packets in the feed; itself without a feed."""
         if self.feed is None or self.secure is None:
             return endpoint
         from skytether.shared.telemetry import ends  # loaded with the feed
@@ -169,12 +169,11 @@ class Process:
 
         Args:
             bind, paths, peers, forms, stopwatch, line, is_patient, memory: see `Shell`.
-            waiting_for: name of the peer whose datagrams the endpoint waits for, for the operator.
+            waiting_for: name of the peer whose datagrams the endpoint waits for, for the log.
             insecure: whether to run without keys at an address that other machines can reach.
             ready: called after all checks, before the first datagram is received.
-
-            on_signal: called at signals for another program, which also uses stdout: events then go
-                to stderr, and the final counters only to the feed and the file.
+            on_signal: called with a signal's number, to pass it on to another program. That program
+                uses stdout: events go to stderr, the final counters only to the feed and the file.
         """
         options, feed, journal = self.options, self.feed, self.journal
         endpoint = self._watched(endpoint, None if line is None else 1)  # socket 1 is the line
@@ -280,7 +279,7 @@ def begin(
         keeps_rows: whether rows go to a temporary file if no record is asked for.
 
     Raises:
-        CommandError: a file or a socket cannot be created; at the end, the record is incomplete.
+        CommandError: a file or socket cannot be created, or the record is incomplete at the end.
     """
     journal, scenario, recalled = _journal(options)
     file = None if options.record and options.record.suffix == RECORDING else options.record
@@ -348,7 +347,7 @@ def _followed(recorder: Recorder, feed: "Feed", part: str, columns: np.dtype[np.
 
 @contextmanager
 def serving(at: str | None, *about: Any) -> Iterator["Metrics | None"]:
-    """Serve metrics at HOST:PORT during the block, of `Collected(*about)`; None without `at`."""
+    """Serve metrics of `Collected(*about)` at HOST:PORT in the block; yields None without `at`."""
     if at is None:
         yield None
         return

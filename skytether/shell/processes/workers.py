@@ -42,8 +42,8 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
         FORK.Process(target=_work, args=(work, number, sockets, os.getpid()))
         for number in range(1, count + 1)
     ]
-    # Blocked until children have set their own handlers; otherwise they would inherit this
-    # process's.
+    # Signals are blocked until parent and children have set their handlers, because an earlier
+    # signal would call an inherited handler.
     signal.pthread_sigmask(signal.SIG_BLOCK, PASSED_ON)
     for child in children:
         child.start()
@@ -70,7 +70,7 @@ def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
     pass_on(signal.SIGTERM, None)
     for child in children:
         child.join()
-    # A worker that got SIGTERM before it could end in order has not failed.
+    # A worker that a signal has killed before it had its own handler has not failed.
     return max(
         0 if child.exitcode in terminated else abs(child.exitcode or 0) for child in children
     )

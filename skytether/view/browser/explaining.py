@@ -25,12 +25,12 @@ from skytether.shell.host import temporary
 from skytether.view.page import words
 
 NICE = 10
-"""Niceness of the explaining processes, so that the page's process comes first."""
+"""Niceness of the explaining processes, which gives the page's process priority."""
 POLL_S = 0.2
 BUTTONS_MAX = 12
 """Largest number of brake events with a button."""
 FIRST = "what went wrong"
-"""Text shown as the step in progress before the process has named one."""
+"""Text shown as the step in progress until the process has named its first step."""
 GRAVEST = "What went wrong?"
 """Label of the button of a flight without brake events."""
 HINT = "Flies the same flight again, without its losses, until the cause is found"

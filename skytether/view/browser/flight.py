@@ -59,7 +59,7 @@ class PageFlight:
         )
         if isinstance(frame, Opened) and self._opened_ns.get(process) != frame.time_ns:
             self._opened_ns[process] = frame.time_ns
-            # Values of the earlier process would be sent to the new one.
+            # Otherwise `undo` and `heal` would send values of the earlier process to the new one.
             self.values.pop(process, None)
             self._before.pop(process, None)
         is_asked = process in PROCESSES or self.state.role(process) == "client"

@@ -8,8 +8,8 @@ on the internet, values of any attribute. `Guard.served` makes it listen with th
 - if there are too many connections, the one that was silent longest is closed;
 - only messages that our page sends (`MESSAGES`) are accepted, of at most 64 KiB in 64 pieces;
 - at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;
-- a browser that does not read gets nothing more, and is disconnected after 40 s, because it does
-  not answer pings, or at once if it sends pings itself.
+- a browser that does not read gets nothing more; it is disconnected after 40 s, because it answers
+  no pings, or at once if it sends pings itself.
 
 A misbehaving browser loses its own connection, and affects no other.
 """
@@ -49,7 +49,7 @@ UNREAD_BYTES = 128 * 1024
 RATE_HZ = 200.0
 """Messages per second that are read from one browser [Hz]; dragging a slider sends 60."""
 BURST_S = 2.0
-"""Size of the largest burst of messages, as the time that they take at RATE_HZ [s]."""
+"""Largest burst of messages that are read at once, as the time that they take at RATE_HZ [s]."""
 MESSAGES = frozenset(
     {
         "GuiUpdateMessage",
@@ -140,7 +140,7 @@ class Guard:
             }
             return serve(partial(self._handle, handler), *at, **(own | rules))
 
-        # viser has no hook for this, but looks up this name when it starts to listen.
+        # viser has no hook for this, but looks up `sockets.serve` when it starts to listen.
         sockets.serve = guarded  # type: ignore[assignment, misc]
         try:
             yield
@@ -190,7 +190,7 @@ class Guard:
                 self.browsers -= 1
 
     def arrive(self, newcomer: "_Connection") -> None:
-        """Count a connection; if there are too many, end the one silent longest, or this one."""
+        """Count a connection. If there are too many, end the longest silent one or the new one."""
         self.connections += 1
         self.idle[newcomer] = None
         if self.connections > CONNECTIONS_MAX and not self._make_room(newcomer):
@@ -218,7 +218,7 @@ class _Connection(sockets.ServerConnection):
         super().__init__(*protocol, **limits)
         self._guard = guard
         self._due_s = 0.0
-        """Time at which the last message so far would come if all came at RATE_HZ [s]."""
+        """Time at which the last message would have come if messages came at RATE_HZ [s]."""
         self._is_cut = False
         """Whether this guard has ended the connection."""
 
@@ -242,7 +242,7 @@ class _Connection(sockets.ServerConnection):
             self.cut(TurnedAway.ROOM)
 
     def process_event(self, event: Any) -> None:
-        """End a connection that sends pings without reading the answers, which would queue up."""
+        """End a connection that sends pings but does not read the answers: they would queue up."""
         if isinstance(event, Frame) and event.opcode is Opcode.PING and self.paused:
             self.cut(TurnedAway.ROOM)
         super().process_event(event)

@@ -53,7 +53,7 @@ class Page:
     """Page that shows flights to browsers.
 
     Args:
-        host, port: address that it listens at.
+        host, port: address that the page's server listens at.
         now_ns: function that returns the time of the frames [ns]; by default this machine's clock.
         token: secret that lets a visitor watch and change the flight from any machine; empty for
             none.
@@ -82,7 +82,7 @@ class Page:
         """Text that says what flights wait for, shown until they begin."""
         self._scene: Scene | None = None
         self._shown: tuple[object, ...] = ()
-        """State for which the scene was built."""
+        """Properties of the flights for which the scene was built."""
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -130,7 +130,7 @@ class Page:
                 with self._alone(number):
                     self._panels[number] = self._panel(client)
                 draws = True
-                break  # one per redraw, which bounds the cost of a browser that keeps reconnecting
+                break  # one panel per redraw bounds the cost of a browser that keeps reconnecting
         with self._server.atomic():
             self._scene.move(states)
             if draws:

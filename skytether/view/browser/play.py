@@ -20,7 +20,7 @@ class Operator:
     """Sender of changes to a flight's processes, in its own thread.
 
     Args:
-        folder: folder of their control sockets.
+        folder: folder of the processes' control sockets.
         answered: called in the thread with a process's name, the requested values, and the answer,
             or None without an answer.
     """

@@ -1,7 +1,7 @@
 """Descriptions of changes in flight, such as "Loss 10 → 30 %".
 
-A process reports a change as two values of a key (`Changed`), which are whole texts for impairments
-and triggers. Descriptions have only the difference, in names and units of the sliders.
+A process reports a change as a key's values before and after (`Changed`); for impairments and
+triggers, these are whole texts. Descriptions have only the difference, in the sliders' units.
 """
 
 from collections.abc import Mapping, Sequence
@@ -76,7 +76,7 @@ def in_words(event: Changed) -> str:
 
 
 def _turned(key: str, before: Any, after: Any) -> str:
-    """Description of a change by sliders; empty if sliders do not describe all of it."""
+    """Change in terms of sliders, as text; empty if sliders do not describe all of it."""
     said, values = [], {key: before}
     try:
         for knob in KNOBS:
@@ -91,7 +91,7 @@ def _turned(key: str, before: Any, after: Any) -> str:
 
 
 def _differing(before: str, after: str) -> tuple[str, str]:
-    """Calls that are not in both texts; the whole texts if calls are not joined by &."""
+    """Calls that only one of the texts has; the whole texts if their calls are not joined by &."""
     try:
         was, now = ([each.text for each in calls(text, "")] for text in (before, after))
     except GrammarError:

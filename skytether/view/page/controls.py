@@ -1,6 +1,6 @@
 """Numbers that may be changed in flight, described as sliders of a page.
 
-Each has a name, a range, and functions that read and write the keys of a process that may change
+Each slider has a name, a range, and functions that read and write changeable keys of a process
 (docs/operating.md). Values are not checked here: the processes check changes like a scenario.
 """
 
@@ -110,7 +110,7 @@ def _own(key: str) -> tuple[Read, Write]:
 
 
 def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
-    """Slider for the first argument of an impairment in both directions, in another unit.
+    """Functions of a slider for the first argument of an impairment in both directions.
 
     Args:
         names: names of impairments; the one in a direction's text is changed.
@@ -133,7 +133,7 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
 
 
 def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
-    """Slider for a component of a list with one number per axis, or of an empty list."""
+    """Functions of a slider for one number of a list with one per axis; an empty list means 0."""
 
     def write(values: Values, number: float) -> dict[str, Any]:
         numbers = list(values[key]) or [0.0] * axes

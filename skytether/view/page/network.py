@@ -134,7 +134,7 @@ class Network:
         return self._by_second(self._bytes[:, direction], now_ns)
 
     def losses(self, direction: int, now_ns: int) -> Array:
-        """Share of packets lost in each of the last SPAN_S seconds; NaN if none; shape
+        """Share of packets lost in each of the last SPAN_S seconds, NaN without packets; shape
         (SPAN_S,).
         """
         packets = self._by_second(self._packets[:, direction], now_ns)
@@ -146,7 +146,7 @@ class Network:
         return self._by_second(self._waiting[:, direction], now_ns)
 
     def delays_s(self, direction: int, now_ns: int) -> Array:
-        """Mean delay in each of the last SPAN_S seconds [s]; NaN without any; shape (SPAN_S,)."""
+        """Mean delay in each of the last SPAN_S seconds [s], NaN if no packet; shape (SPAN_S,)."""
         through = self._packets[:, direction] - self._lost[:, direction]
         total_ns = self._by_second(self._delay_ns[:, direction], now_ns)
         count = self._by_second(through, now_ns)
@@ -172,6 +172,6 @@ class Network:
         return sums
 
     def horizon_bytes(self, now_ns: int) -> float:
-        """Mean size of the last minute's packets that carry a horizon [B]; NaN without any."""
+        """Mean size of the last minute's packets that carry a horizon [B]; NaN if none does."""
         count, size = self._horizons[self._since(SPAN_S, now_ns)].sum(axis=0)
         return float(size / count) if count else np.nan

@@ -24,9 +24,9 @@ SEEN = 4.0
 SPARE = 6
 """Number of zeros left at the end of a cropped plot."""
 HEIGHT, BANDS_HEIGHT, AXIS = 115, 75, 35
-"""Heights of a plot and a plot of bands without horizontal axis, and of the axis [pixels]."""
+"""Heights of a plot and of a plot of bands, without horizontal axis, and of this axis [pixels]."""
 BAND_MODE, BAND_LINK, BAND_ENDS = 2.0, 1.0, (0.0, 3.0)
-"""Vertical positions of the bands for mode and link in `STATE`, and its vertical range."""
+"""Vertical positions of the bands for mode and link in the plot `STATE`, and its range."""
 GREY = "#868e96"
 UP, DOWN = "#12b886", "#e64980"
 """Colours of the two directions, in plots of one flight or of data that all flights share."""
@@ -64,7 +64,7 @@ class PlotLine:
     label: str
     values: Values
     rgb: str = ""
-    """Colour; empty, or if several flights have this line: the flight's colour."""
+    """Colour of the line; if it is empty, or several flights have the line, the flight's colour."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
     once: bool = False
@@ -151,7 +151,7 @@ def _deadline_ms(look: Look) -> Array:
 
 
 def _compared(look: Look) -> Array:
-    """Figure that the trigger compares, cut off at SEEN thresholds to keep these visible."""
+    """Figure that the trigger compares, cut off at SEEN times the threshold."""
     most = np.where(look.curves.threshold > 0, SEEN * look.curves.threshold, np.inf)
     return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
 
@@ -386,10 +386,10 @@ class Plots:
 
 
 def on_one_axis(plots: Sequence[Sequence[Array]]) -> list[list[Array]]:
-    """Data of plots on one time grid, the finest, from the first time with a value in any plot.
+    """Data of plots on the finest of their time grids, from the first value in any plot on.
 
     Args:
-        plots: times of each plot, and its values at them.
+        plots: times of each plot, and the plot's values at these times.
     """
     if not plots:
         return []
@@ -435,7 +435,7 @@ def cropped(data: Sequence[Array]) -> list[Array]:
 def drawable(data: Sequence[Array]) -> list[Any]:
     """Data for uPlot: None in gaps, because uPlot draws no line that contains NaN.
 
-    A list, because viser converts everything in a tuple to numbers.
+    The result is a list, because viser converts all items of a tuple to numbers.
     """
     return [_with_gaps(values) if np.isnan(values).any() else values for values in data]
 

@@ -41,7 +41,7 @@ SHADE = 0.45
 SIZE = 0.05
 """Size of a vehicle, relative to the extent of the flight."""
 WIDE, NARROW = 1.5, 0.6
-"""Aspect ratios (width over height) of a wide window, and of the widest narrow one."""
+"""Aspect ratios (width over height) of a wide window, and of the widest narrow window."""
 FOV_RAD = 0.7
 
 
@@ -53,7 +53,7 @@ def in_space(points: Array) -> NDArray[np.float32]:
 
 
 def segments(points: Array, *, dashed: bool = False) -> NDArray[np.float32]:
-    """Line through points, as segments, without those that contain NaN; shape (n, 2, 3)."""
+    """Line through points, as segments; segments with NaN are left out; shape (n, 2, 3)."""
     placed = in_space(points)
     pieces = np.stack([placed[:-1], placed[1:]], axis=1)
     pieces = pieces[~np.isnan(pieces).any(axis=(1, 2))]

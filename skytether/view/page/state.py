@@ -51,7 +51,7 @@ from skytether.view.page.network import BIN_NS, BINS, DIRECTIONS, SPAN_S, Networ
 from skytether.view.rows import check_columns, check_values, planned
 
 SLOTS_MAX = 1200
-"""Largest number of stored steps of a vehicle; with more steps per minute, only every n-th is
+"""Largest number of stored steps of a vehicle; if a minute has more steps, only every n-th step is
 stored."""
 VEHICLES_MAX = 64
 ZONED, GUIDED = "mission.zones", "mission.goals"
@@ -60,7 +60,7 @@ PLANS_MAX = 8
 """Number of stored plans of a vehicle, including retransmissions."""
 SAID_MAX = 50
 FOLDED_S = 10.0
-"""Time within which an event with the same text is counted, not shown again [s]."""
+"""Time within which events with the same text are shown once, with their number [s]."""
 AT_ONCE_S = 2.0
 """Time within which changes of one key, as by a dragged slider, count as one change [s]."""
 LIVE_POINT = "reference.points_m"
@@ -132,7 +132,7 @@ class VehicleTrack:
     def __init__(self, number: int, scenario: Scenario) -> None:
         self.number = number
         self.client = self.server = ""
-        """Processes of the newest rows from client and server; empty before any."""
+        """Names of the client and the server that sent the newest rows; empty before any rows."""
         self._scenario = scenario
         steps = max(1, round(SPAN_S / scenario.control.dt))
         self._stride = -(-steps // SLOTS_MAX)
@@ -199,7 +199,7 @@ class VehicleTrack:
         self._plans.extend(row.copy() for row in rows[-PLANS_MAX:])
 
     def _at(self, steps: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Ring index of each step, cleared if it is new; -1 for a step that is not kept."""
+        """Ring index of each step; the slot of a new step is emptied; -1 for a step not kept."""
         slots = steps // self._stride
         at = slots % self._slots
         newest = np.maximum(self._ring["slot"][at], self._ring["slot"].max() - self._slots)
@@ -297,7 +297,7 @@ class VehicleTrack:
     def path(self, points: int) -> Array:
         """Positions at evenly spaced times of the last minute [m]; shape (points, axes).
 
-        The last one is the newest known position; unknown positions are NaN.
+        The last position is the newest known position; unknown positions are NaN.
         """
         is_known = ~np.isnan(self._ring["position"][:, 0])
         last = int(self._ring["slot"].max(where=is_known, initial=-1))
@@ -326,13 +326,13 @@ class VehicleTrack:
         return float(np.sqrt(squares.mean())) if len(squares) else np.nan
 
     def _kept(self, seconds: float) -> NDArray[np.void]:
-        """Slots of the last seconds, oldest first, without empty ones at the start."""
+        """Slots of the last seconds, oldest first, without empty slots at the start."""
         slots = self._ring["slot"]
         recent = slots[(slots >= 0) & (slots > slots.max() - seconds / self._slot_s)]
         return self._at_slots(np.arange(recent.min(), recent.max() + 1) if len(recent) else recent)
 
     def _at_slots(self, slots: NDArray[np.int64]) -> NDArray[np.void]:
-        """Slots of the ring buffer, by number; an empty slot for one that is no longer kept."""
+        """Slots of the ring buffer, by number; a slot that is no longer kept is returned empty."""
         rows = self._ring[slots % self._slots]
         rows[(rows["slot"] != slots) | (slots < 0)] = self._empty
         return rows
@@ -369,7 +369,7 @@ class _Process:
     columns: dict[str, np.dtype[np.void]]
     newest_ns: int = 0
     seen_ns: int = -1
-    """Time up to which frames were received before a reconnection [ns]."""
+    """Time of the newest frame received before a reconnection [ns]; older frames are repeats."""
     figures: dict[str, Any] = field(default_factory=dict)
 
 
@@ -383,7 +383,7 @@ class State:
     def _begin(self) -> None:
         self.name = ""
         self.scenario = Scenario()
-        """Scenario of the first process that sent frames; the client's once it sends any."""
+        """Scenario of the first process that sent frames; the client's once it sends frames."""
         self.duration_s = 0.0
         """Length of the flight [s], from the client if it sends frames."""
         self.vehicles: dict[int, VehicleTrack] = {}
@@ -397,7 +397,7 @@ class State:
         self.marks: deque[tuple[float, Mark]] = deque(maxlen=SAID_MAX)
         """Newest changes, oldest first, with their times of flight [s]."""
         self.changed: dict[tuple[str, str], Changed] = {}
-        """Newest change, by process and key; several entries if it was merged from several."""
+        """Newest change, by process and key; several entries if several changes were merged."""
         self.newest_ns = 0
         self.begin_ns: int | None = None
         """Start of the flight's step 0 [ns]; None before any step."""
@@ -570,7 +570,7 @@ class State:
         return {way: name.replace("_", " ") for way, name in enumerate(self.ways)}
 
     def time_s(self, time_ns: int) -> float:
-        """Time of flight [s] at a time [ns], 0 before it; for netem alone, its running time."""
+        """Time of flight [s] at a time [ns], 0 until a step is flown; for netem alone, its age."""
         begin_ns = self.begin_ns
         if begin_ns is None and not self.flies:
             begin_ns = min((each.opened.time_ns for each in self._processes.values()), default=None)
@@ -601,7 +601,7 @@ class State:
             return Zones()
 
     def waits(self, number: int) -> str:
-        """Reason, by the server, why a vehicle of a mission waits; empty if it does not."""
+        """Reason that the server gives why a vehicle of a mission waits; empty without a wait."""
         reason = self.of_vehicle("server", number).get("waits", "")
         return reason if isinstance(reason, str) else ""
 
@@ -614,8 +614,8 @@ class State:
         return figure(figures, "clock_bound_ms"), figure(figures, "clock_m")
 
     def paths(self, number: int) -> list[tuple[dict[str, Any], dict[str, Any]]]:
-        """Figures of each path of a vehicle's session, of the server and of the vehicle; empty for
-        a single path.
+        """Figures that server and vehicle have of each path of the vehicle's session; empty for a
+        single path.
         """
         nothing: dict[str, Any] = {}
         up, down = (self.of_vehicle(role, number).get("paths") for role in ("server", "client"))
@@ -660,7 +660,7 @@ class State:
         return heard.role if heard else ""
 
     def figures(self, role: str) -> dict[str, Any]:
-        """Figures of the first process of a role that has sent any; otherwise empty."""
+        """Figures of the first process of a role that has sent figures; empty if none has."""
         all_figures = (each.figures for each in self._processes.values() if each.role == role)
         return next(filter(None, all_figures), {})
 

@@ -226,7 +226,7 @@ def _paths(state: State, vehicle: int) -> list[tuple[str, ...]]:
 
 
 def _path(path: int, ends: tuple[dict[str, Any], dict[str, Any]]) -> tuple[str, ...]:
-    """Texts in the order of PATH, from the figures of the server and of the vehicle."""
+    """Texts of a path's column, in the order of PATH, from figures of server and vehicle."""
     fails_up, fails_down = (figure(end, "failure") for end in ends)
     silent = [way for way, fails in (("up", fails_up), ("down", fails_down)) if fails > SILENT]
     is_known = not np.isnan([fails_up, fails_down]).all()

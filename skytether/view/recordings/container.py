@@ -61,10 +61,10 @@ CHUNK = re.compile(rb"\x06.{36}\x04\0\0\0zstd.{8}\x28\xb5\x2f\xfd", re.DOTALL)
 """Pattern of a chunk's beginning, to find the next chunk after a damaged record."""
 CHUNK_HEAD_BYTES = 57
 DAMAGES_MAX = 100
-"""Largest number of damaged places after which reading continues; it bounds the reading time."""
+"""Largest number of damaged places that reading skips; it bounds the reading time."""
 
 CHUNK_BYTES_MAX = 5 * 1024 * 1024
-"""Largest size of a decompressed chunk [B]; Skytether writes 256 KiB and a message."""
+"""Largest size of a decompressed chunk [B]; Skytether's have 256 KiB plus a message."""
 SPARE_BYTES = 16 * 1024 * 1024
 """Total decompressed size of chunks that even a small file may have [B]."""
 RATIO_MAX = 50
@@ -98,7 +98,7 @@ def reading(path: Path) -> Iterator[None]:
         yield
     except RecordingError:
         raise
-    except ConfigError as error:  # scenario of another version, or its file is missing here
+    except ConfigError as error:  # scenario of another version, or one that names a missing file
         raise RecordingError(f"{path}: {error}") from None
     except FeedError as error:  # the frame is invalid, though its chunk has the right checksum
         raise RecordingError(f"{path}: it is of another version, or damaged: {error}") from None
@@ -145,8 +145,8 @@ class Container:
     def messages(self) -> Iterator[tuple[str, bytes]]:
         """Topics and contents of messages with the encoding ENCODING, in file order.
 
-        Damaged records are skipped, and everything before the next chunk. The copy of a message is
-        returned if the message is lost.
+        A damaged record is skipped, with everything up to the next chunk. If a message is lost, its
+        copy is returned.
 
         Raises:
             BROKEN: the file has contents that no flight writes.
@@ -166,7 +166,7 @@ class Container:
                 case Message(channel_id=number) if number not in topics:
                     if not self.damaged_bytes:
                         raise ValueError(f"a message before its channel {number}")
-                    # With copies, a channel that is still unknown is only for other programs.
+                    # In a file with copies, an unknown channel is one for other programs.
                     self.damaged_bytes += 0 if has_copies else len(record.data)
                 case Message(channel_id=number) if topic := topics[number]:
                     messages_left -= 1
@@ -180,7 +180,7 @@ class Container:
         for record in self._chunks():
             size = record.uncompressed_size
             if fault := _fault(record):
-                if not record.uncompressed_crc:  # Skytether always writes it
+                if not record.uncompressed_crc:  # Skytether always writes this checksum
                     raise ValueError(fault)
                 self.damaged_bytes += len(record.data)
                 continue
@@ -195,7 +195,7 @@ class Container:
                 yield from records
 
     def _chunks(self) -> Iterator[Chunk]:
-        """Chunks up to the end of the data; counts what is damaged or lost between them."""
+        """Chunks up to the end of the data; counts the damaged and lost bytes between them."""
         at, checksum = len(MAGIC), crc32(MAGIC)
         for _ in range(DAMAGES_MAX):
             while (content := self._framed(at)) and (record := _parsed(content)):

@@ -75,7 +75,7 @@ def _names(recordings: Sequence[Recorded]) -> list[dict[str, str]]:
 
 def _scenario(first: Recorded, recordings: Sequence[Recorded]) -> Scenario:
     table = to_table(first.scenario)
-    # The netem of a path has only this path's network.
+    # The scenario of a path's netem has only this path's network.
     impaired = keys_of(InFlight.IMPAIRMENT) if first.scenario.network.paths else ()
     for recorded in recordings:
         terms = first.scenario.terms(), recorded.scenario.terms()

@@ -80,7 +80,7 @@ class Ended:
     nearest_m: float | None
     """Smallest distance to another vehicle during the mission [m]."""
     nearest: int | None
-    """Number of the other vehicle at that distance."""
+    """Number of the other vehicle at the distance `nearest_m`."""
 
 
 class Outcome:
@@ -98,7 +98,7 @@ class Outcome:
         self.numbers: list[int] = np.unique(client["vehicle"]).tolist()
         self.rows: dict[int, Rows] = {}
         self.began_s: dict[int, float] = {}
-        """Time of each vehicle's step 0 since that of the first vehicle [s]."""
+        """Time of each vehicle's step 0 since step 0 of the first vehicle [s]."""
         for number in self.numbers[:VEHICLES_MAX]:
             at = np.flatnonzero(client["vehicle"] == number)
             self.rows[number] = client[at]
@@ -136,7 +136,7 @@ class Outcome:
 
     @cached_property
     def least(self) -> dict[tuple[int, int], tuple[float, float]]:
-        """Smallest distance of each two vehicles on a mission, and its time [m, s]."""
+        """Smallest distance between each two vehicles of a mission [m], and its time [s]."""
         found = {}
         for pair in combinations(self._tracks, 2):
             times_s, apart_m = nearest([self._tracks[each] for each in pair], self._dt_s)
@@ -198,8 +198,8 @@ class Outcome:
     def happened(self) -> list[tuple[float, tuple[int, ...], str]]:
         """Failures and takeovers: time [s], vehicles and sentence, in order of time.
 
-        The same event of several vehicles is shown once; outages of a path below BRIEF_S are
-        omitted.
+        The same event of several vehicles is listed once. Outages of a path that are shorter than
+        BRIEF_S are left out.
         """
         found: list[tuple[float, list[int], str]] = []
         newest: dict[str, list[int]] = {}
@@ -259,8 +259,8 @@ class Outcome:
 
 
 def brakes(recorded: Recorded) -> list[tuple[float, str]]:
-    """Times of flight at which a vehicle brakes, lands or has a fault [s], and the event as a
-    sentence; if several vehicles brake at once, the first vehicle's.
+    """Times of flight [s] at which a vehicle brakes, lands or has a fault, and the event as a
+    sentence. Of several vehicles that brake at once, only the first is listed.
     """
     worse, stopped = ([str(mode) for mode in modes] for modes in (WORSE, STOPPED))
     found: list[tuple[float, str]] = []

@@ -48,7 +48,7 @@ class Recorded:
     frames: Sequence[Timed]
     """Frames in order of time; times count from the first frame [ns]."""
     parts: Mapping[str, Table]
-    """Rows of each part of the record with any rows, by its name, in the order of recording."""
+    """Rows of each part of the record that has rows, by the part's name, in order of recording."""
     times_ns: Mapping[str, Indices]
     """Time of each row of `parts`, counted from the first frame [ns]."""
     lost_bytes: int | None
@@ -71,7 +71,7 @@ class Recorded:
 
     @property
     def can_be_explained(self) -> bool:
-        """Whether its flight can be flown again, if over UDP by the packets at both ends."""
+        """Whether the flight can be flown again; over UDP, from the packets at both ends."""
         return not self.about.began or (ends.PART in self.parts and not self.scenario.keeps_apart)
 
     @property
@@ -237,12 +237,12 @@ def _columns(described: str) -> np.dtype[np.void]:
 
 @lru_cache(8)
 def _check_begun(scenario: str) -> None:
-    """Check the scenario of a process; cached, because many processes may have the same."""
+    """Check a process's scenario; cached, because many processes may have the same scenario."""
     check(toml.loads(scenario), "the scenario of a process", any_network=True)
 
 
 def _failure(events: list[FlightEvent]) -> Failure | None:
-    """Failure of the first vehicle, by number, whose last event is one; None without any."""
+    """Failure of the lowest-numbered vehicle whose last event is a failure; None without any."""
     last: dict[int, Event] = {
         each.event.vehicle: each.event
         for each in events

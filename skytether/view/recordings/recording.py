@@ -11,7 +11,7 @@ Other programs get a channel of JSON for each topic:
 
     /vehicle/N/flown     rows of the client's part, see `view.rows`
     /vehicle/N/decided   rows of the server's part
-    /vehicle/N/plan      rows of its plans
+    /vehicle/N/plan      rows of the plans for the vehicle
     /netem/packets       rows of netem's part
     /said                events
     /figures/PROCESS     counters so far
@@ -20,7 +20,7 @@ Foxglove and Lichtblick draw /events, and for each of the first VEHICLES_MAX veh
 /vehicle/N/pose, /vehicle/N/transform and, below /vehicle/N/scene, the vehicle, its plan, its
 desired position and its trajectory. The scenario and, at the end, the summary are attachments. A
 chunk is complete as soon as it is written. The first message of each topic that `recorded` reads
-has its own chunk, and its copy the next chunk: the rest can be read if one of them is lost.
+has its own chunk, and its copy the next chunk, so that the rest can be read if either is lost.
 """
 
 from collections.abc import Mapping
@@ -55,7 +55,7 @@ OURS = "skytether"
 """Name of the metadata record and of the writing library in the file."""
 SCENARIO, SUMMARY = "scenario.toml", "summary.json"
 VEHICLES_MAX = 64
-"""Largest number of vehicles with drawn messages; for further vehicles only rows are recorded."""
+"""Largest number of vehicles with messages for drawings; further vehicles have only rows."""
 CHUNK_BYTES = 256 * 1024
 POINTS_MAX = 400
 WARNINGS = RecordIncomplete, Fault, Degraded, ChangeRefused, Failure
@@ -163,7 +163,7 @@ class Recording:
         self._add(f"{FEED}{process}", ENCODING, 0, feed.pack(frame))
 
     def _add_twice(self, topic: str, content: bytes) -> None:
-        """Add a topic's first message and its copy; other messages cannot be read without it."""
+        """Add a topic's first message, without which the others cannot be read, and its copy."""
         self.flush()
         self._add(topic, ENCODING, 0, content)
         self.flush()

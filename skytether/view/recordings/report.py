@@ -211,7 +211,7 @@ def _why(recorded: Recorded, outcome: Outcome, explanation: str) -> list[Part]:
 
 
 def _theorem(recorded: Recorded) -> list[Part]:
-    """What the theorem of separation assumes, if it is a mission of which all is recorded."""
+    """The theorem's assumptions; empty unless server and plans of a mission are recorded."""
     if not recorded.scenario.keeps_apart or not {"server", "plan"} <= recorded.parts.keys():
         return []
     from skytether.theorem.judgement import HEADING, TITLE, judged
@@ -350,7 +350,7 @@ def _trigger(below: "Axes", flown: ReportedFlight) -> None:
     style: Any = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
     below.vlines(sent, 0.0, 0.12, **style)
     threshold = server["threshold"][np.isfinite(server["threshold"])]
-    # The figure grows by decades while nothing can be sent; only the threshold matters.
+    # While nothing can be sent, the figure grows by decades: the axis is linear to the threshold.
     below.set_yscale("symlog", linthresh=max(threshold.max(initial=0.0), 1e-6))
     below.set_ylim(bottom=0.0)
 
