@@ -45,14 +45,14 @@ TRAIN = 16
 TRAIN_SLOTS = 2 * TRAIN
 """Number of grid points that a train takes, in place of one probe at each."""
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
-"""Shortest time [ns], and smallest number of probes, from one train to the next."""
+"""From one train to the next: shortest time [ns], and smallest number of grid points."""
 HELLO_BYTES = 64
 """Size of an unencrypted HELLO [B]: larger than a WELCOME, against amplification attacks."""
 PATIENCE_NS = 10 * SECOND_NS
 """Longest wait for the first answer [ns]."""
 POLL_NS = 100 * MILLISECOND_NS
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
-"""Bounds of the wait for the last answers, which is twice the longest round-trip time [ns]."""
+"""Shortest and longest wait for the last answers [ns]; between, twice the longest round trip."""
 
 Longs = NDArray[np.int64]
 

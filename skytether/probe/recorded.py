@@ -22,7 +22,7 @@ def of_log(path: RecordedPath) -> MeasuredPath:
 
 
 def round_trips(path: RecordedPath) -> RoundTrips:
-    """Round trips of a log, on the clock of the file."""
+    """Round trips of a log, on the log's clock."""
     trip_s = np.where(path.lost, np.nan, 2.0 * path.delay_s)
     return RoundTrips(path.begin_s + path.time_s, trip_s)
 

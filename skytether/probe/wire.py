@@ -70,9 +70,9 @@ class ProbeAnswer(NamedTuple):
     number: int
     """Number of the answered arrival, from 0; NO_NUMBER in an answer to a request for a report."""
     sent_ns: int
-    """Time of sending, on the listener's clock [ns]."""
+    """Time of sending the answer, on the listener's clock [ns]."""
     first: int
-    """Number of the first reported arrival."""
+    """Number of the first arrival in `arrivals`."""
     logged: int
     """Number of arrivals at the listener so far."""
     arrivals: tuple[tuple[int, int], ...]

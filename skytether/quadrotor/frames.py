@@ -80,8 +80,8 @@ CRAZYFLIE = Frame(
     rate_gain=72.0,
     rate_damping=3.0,
 )
-"""Crazyflie 2.0: body, rotors and lag as in rotorpy 3.0 (`crazyflie_params.py`). Its sources are
-Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", ETH Zürich 2015,
+"""Crazyflie 2.0: body, rotors and lag as in rotorpy 3.0 (`crazyflie_params.py`). rotorpy's sources
+are Förster, "System Identification of the Crazyflie 2.0 Nano Quadrocopter", ETH Zürich 2015,
 measurements by Bitcraze, and for the lag Eschmann et al., "Data-Driven System Identification of
 Quadrotors Subject to Motor Delays", 2024. Battery and current: 250 mAh and 7 minutes of flight, as
 stated by Bitcraze; the resistance is assumed, typical of a cell of that size."""

@@ -82,7 +82,7 @@ class Quadrotor:
         """Set the wind.
 
         Args:
-            steady_mps: velocity of steady wind along the first axes [m/s; x, y, z].
+            steady_mps: velocity of the steady wind [m/s; x, y, z]; 0 along missing axes.
             turbulence_mps: wind speed 6 m above ground that determines the gusts [m/s].
         """
         steady = np.zeros(3)

@@ -1,1 +1,1 @@
-"""Built-in scenarios, one TOML file each; only `compare.toml` contains several, in tables."""
+"""Built-in scenarios, one TOML file each; only `compare.toml` has several scenarios, in tables."""

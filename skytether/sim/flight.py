@@ -118,7 +118,7 @@ def fly(
 ) -> Record:
     """Fly a scenario in virtual time.
 
-    The vehicles start at a random phase of the server's grid, drawn from the seed, because in a
+    The vehicles start between two ticks of the server, at a time drawn from the seed, because in a
     real flight the server's ticks are not aligned with the vehicles' steps either.
 
     Args:
@@ -200,7 +200,7 @@ class Run:
             world.add(host, netem)
         addresses: list[Address] = [(host, 0) for host in self._netems]
         self.hosts: dict[str, Endpoint] = dict([*self._netems.items()][:1])
-        """Endpoints of netem, of the first path, and of the vehicles, in this order."""
+        """Endpoints of the first path's netem and of the vehicles, in this order, by host name."""
         self._events: deque[FlightEvent] = deque(maxlen=EVENTS_MAX)
         simulation = scenario.simulation
         clock = Clock(

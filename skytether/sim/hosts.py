@@ -54,7 +54,7 @@ class Host:
     """Rank among hosts that are woken at one instant: 1, 2, … in the order of `Hosts.add`."""
     compute_ns: int
     busy_until_ns: int
-    """Time of the world until which the host computes [ns]; it cannot be woken before."""
+    """Time of the world until which the host computes and cannot be woken [ns]."""
     on_finished: Callable[[], None] | None
     """Function to call once, when the endpoint has finished; None afterwards."""
     armed_ns: int | None = None

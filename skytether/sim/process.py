@@ -46,7 +46,7 @@ class VirtualProcess(Generic[Run]):
         """Let the run end in order if it is up, as SIGTERM does.
 
         Args:
-            look_ns: time between two checks whether it has finished [ns].
+            look_ns: time between two checks whether the run has finished [ns].
             ended: called when the run has ended, unless it is killed before.
         """
         run, latest_ns = self.endpoint, 0

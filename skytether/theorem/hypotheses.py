@@ -115,11 +115,11 @@ class Flown:
     in_force: Indices
     motions: Motions
     motion: Indices
-    """Index in `motions` of the motion in force; -1 if there is none, or it is not recorded."""
+    """Index in `motions` of the motion in force; -1 if no recorded motion is in force."""
 
     @property
     def off_m(self) -> Array:
-        """Distance from the motion in force [m]; NaN if there is none or it is not recorded."""
+        """Distance from the motion in force [m]; NaN without one, or where it is unrecorded."""
         if not len(self.motions.step):
             return np.full(len(self.step), np.nan)
         stage = self.step - self.in_force
@@ -350,7 +350,7 @@ def _separation(scenario: Scenario, record: Record) -> Hypothesis:
 
 
 def _clear(scenario: Scenario, vehicles: Sequence[Flown]) -> Iterator[Hypothesis]:
-    """Distance from the scenario's zones, if any; zones set in flight are not checked."""
+    """Check the distance from the scenario's zones; zones set in flight are not checked."""
     if around := zones(scenario):
         margins = {}
         for each in vehicles:

@@ -36,7 +36,7 @@ OTHER = re.compile(r"vehicle (\d+)( to pass)?|a zone")
 Reason: TypeAlias = tuple[float, int, str]
 """Time of flight [s], vehicle, and what it waits for, as the server's text."""
 Question: TypeAlias = tuple[float, Callable[[World], None]]
-"""Action of a flight: time [s], and what is done then; see `flight.fly`."""
+"""Action in a flight: time [s], and the function called then; see `flight.fly`."""
 Kind = Literal["to begin", "acknowledgement", "way"]
 
 
@@ -47,12 +47,12 @@ class Wait:
     kind: Kind
     vehicle: int
     start_s: float
-    """Time of flight at the beginning [s]."""
+    """Time of flight at which the wait begins [s]."""
     for_s: float
     other: int = 0
     """Number of the vehicle waited for; 0 for a wait without another vehicle, as for a zone."""
     motion_s: float = math.nan
-    """Time of sending of the unacknowledged motion, its own or the other vehicle's [s]."""
+    """Time of sending of the unacknowledged motion, of `vehicle` or of `other` [s]."""
     plans: tuple[int, int] = (0, 0)
     """Number of packets with that motion, and number lost."""
     reports: tuple[int, int] = (0, 0)
@@ -69,7 +69,7 @@ class Wait:
 
 @dataclass(frozen=True, slots=True)
 class _Vehicle:
-    """Vehicle, and the server's knowledge of its motions."""
+    """Vehicle, with the ticks at which the server sent its motions and knew of their acceptance."""
 
     flown: Flown
     time_s: Array
@@ -81,7 +81,7 @@ class _Vehicle:
     is_heard: Flags
     """Whether the server knew at the tick in `heard_at` if the motion was accepted."""
     accepted: Indices
-    """Step from which the vehicle flew each motion; -1 if it never did."""
+    """Step from which the vehicle flew each motion; -1 for a motion that was never flown."""
 
     @property
     def begins_s(self) -> float:
@@ -142,7 +142,7 @@ def _sent_at(rows: Rows, sent: Indices) -> Indices:
 
 
 def _to_begin(vehicles: Sequence[_Vehicle]) -> Iterator[Wait]:
-    """Waits to begin: each vehicle waits for the last one."""
+    """Waits to begin: each vehicle waits for the last vehicle to begin."""
     last = max(vehicles, key=lambda each: each.begins_s, default=None)
     for each in vehicles:
         if last is not None and each.begins_s < last.begins_s:
@@ -175,7 +175,7 @@ def _acknowledgements(
 
 
 def _ways(reasons: Sequence[Reason], others: Sequence[Wait], every_s: float) -> Iterator[Wait]:
-    """Waits for a way, with the packets that the other vehicle waited for, if any was lost."""
+    """Waits for a way; if the other vehicle waited for lost packets, with these packets."""
     last: dict[int, tuple[str, Wait]] = {}
     found = []
     for time_s, vehicle, text in reasons:

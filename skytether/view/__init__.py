@@ -9,5 +9,5 @@
 The input is frames (`shared.telemetry.feed`), from a feed, a recording or a flight in virtual time.
 Recordings and the page do not import each other, and either may be missing. `make check` tests that
 `browser` imports `page`, and `page` and `recordings` import `rows` and `frames`, never the reverse.
-They may import `figures`, `sim` and what these import.
+`view` may import `figures`, `sim` and the packages that these import.
 """

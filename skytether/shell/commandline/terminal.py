@@ -28,8 +28,8 @@ class Bar(Protocol):
 def progress(title: str, total: float, unit: str = "s") -> Iterator[Bar]:
     """Progress bar on stderr: title, progress and the time remaining.
 
-    The bar disappears at the end. It is shown only if stderr is a terminal that can move its
-    cursor. Lines printed on stderr meanwhile appear above it.
+    The bar is shown only if stderr is a terminal that can move its cursor, and disappears at the
+    end. Lines printed on stderr meanwhile appear above it.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn

@@ -33,7 +33,7 @@ from skytether.shared.telemetry.feed import (
 from skytether.shell.host.local import Local
 
 READERS_MAX = 8
-"""Largest number of readers at once; further ones are refused and counted."""
+"""Largest number of readers at once; further readers are refused and counted."""
 WAITING_BYTES_MAX = 4 * 1024 * 1024
 """Largest number of bytes queued for a reader; a slower reader is disconnected and counted."""
 BACKLOG_BYTES_MAX = 1024 * 1024
@@ -131,7 +131,7 @@ class Feed:
         return described(self._columns)
 
     def open(self, opened: Callable[[], Opened]) -> None:
-        """Accept readers once the event loop runs; `opened` makes the first frame for each."""
+        """Accept readers once the event loop runs; `opened` makes each reader's first frame."""
         self._opened = opened
 
     def begin(self, loop: AbstractEventLoop) -> None:

@@ -42,7 +42,7 @@ QUEUE = 10_000
 RESOLVERS = ("/run/nscd", "/run/systemd/resolve")
 """Folders of sockets through which this machine resolves names for programs."""
 FORBIDDEN = (EACCES, EPERM, ENOSPC)
-"""Errors if the system or a container does not allow namespaces; ENOSPC: too many exist."""
+"""Errors if the system or a container does not allow namespaces; ENOSPC: there are too many."""
 ADMIN = ":/usr/local/sbin:/usr/sbin:/sbin"
 """Folders that are missing in the PATH of ordinary users."""
 

@@ -47,7 +47,7 @@ class _Envelope(msgspec.Struct, frozen=True, array_like=True):
     written_ns: int
     """Time of writing [ns; monotonic clock of the host]."""
     identity: dict[str, str]
-    """Names and values that must match the reader's: vehicle, flight."""
+    """Identity of the writer by name: vehicle, flight; the reader must have the same."""
     content: bytes
 
 
@@ -157,7 +157,7 @@ class MemoryFile:
     # -- in flight -----------------------------------------------------------------------------
 
     def begin(self, endpoint: Endpoint, loop: asyncio.AbstractEventLoop) -> None:
-        """Start the thread that writes the endpoint's memory and acknowledges it."""
+        """Start the thread that writes the endpoint's state and confirms writes to the endpoint."""
         self._endpoint, self._loop = endpoint, loop
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()

@@ -2,9 +2,9 @@
 
     program ── TUN device ── netem ── slirp4netns ── this machine's sockets
 
-slirp4netns translates packets to sockets of this machine, as for a virtual machine. It gets
-Ethernet frames through a Unix socket, in its mode for User Mode Linux, and so needs no namespace.
-See `shell.driving.inside` for the program.
+slirp4netns translates packets to sockets of this machine, as for a virtual machine. slirp4netns
+gets Ethernet frames through a Unix socket, in its mode for User Mode Linux, and so needs no
+namespace. See `shell.driving.inside` for the program.
 """
 
 import asyncio

@@ -106,7 +106,7 @@ class ByteStream:
 
 
 def prepare(port: int, baud: int) -> None:
-    """Configure a serial port, a file descriptor, for raw bytes at a rate that the system supports.
+    """Configure a serial port, given as a file descriptor, for raw bytes at a supported bit rate.
 
     Raises:
         termios.error: the file is not a serial port.

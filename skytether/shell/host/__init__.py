@@ -1,1 +1,1 @@
-"""Functions of the operating system: sockets, timers, files, and optional features."""
+"""Functions of the operating system: sockets, timers, files, features that may be missing."""

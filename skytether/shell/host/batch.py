@@ -32,7 +32,7 @@ SIZE_MAX = 2048
 SEGMENTS_MAX = 64
 """Largest number of datagrams sent as one long datagram; older kernels refuse more."""
 SEGMENTED_BYTES_MAX = 65_000
-"""Largest total payload of the datagrams that are sent as one [B]; IP allows a little more."""
+"""Largest total payload of datagrams sent as one long datagram [B]; IP allows a little more."""
 SEGMENT_BYTES_MAX = SEGMENTED_BYTES_MAX // 2
 """Largest payload with which two datagrams fit into one long datagram [B]."""
 
@@ -50,7 +50,7 @@ _BUFFER = struct.Struct("@QQ")
 _MSG_DONTWAIT = 0x40
 _SO_TIMESTAMPNS = 35
 _STAMP = struct.Struct("@Qiiqq")
-"""Layout of the control data with a time: size, level and type, seconds and nanoseconds."""
+"""Layout of control data with a time stamp: size, level and type, seconds and nanoseconds."""
 _IPV4, _IPV6 = struct.Struct("=HH4s8x"), struct.Struct("=HHI16sI")
 """Layouts of `struct sockaddr_in` and `sockaddr_in6`; ports are in network order."""
 _WHOLE = memoryview(array("Q", [_STAMP.size] * BATCH_MAX))

@@ -33,7 +33,7 @@ def alone(folder: Path | None, on_wait: Callable[[], None]) -> Iterator[None]:
     """During the block, keep other commands from compiling machine code for the same folder.
 
     Args:
-        folder: None if machine code is not stored.
+        folder: folder of the stored machine code; None if no code is stored.
         on_wait: called once if another command is compiling.
     """
     try:

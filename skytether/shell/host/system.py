@@ -15,7 +15,7 @@ from errno import EAFNOSUPPORT
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-if TYPE_CHECKING:  # `start` imports this before anything slow
+if TYPE_CHECKING:  # `start` imports this module first, so it imports nothing slow
     import asyncio
 
 

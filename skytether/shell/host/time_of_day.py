@@ -78,7 +78,7 @@ class TimeTeller:
         self._is_known = True
 
     def news(self) -> TimeUnknown | None:
-        """Pass the time of day to the endpoint; returns an event when it becomes unknown."""
+        """Pass the time of day to the endpoint; returns an event when the time becomes unknown."""
         time_of_day, was_known = host_time(), self._is_known
         self._is_known = time_of_day is not None
         if time_of_day is None:

@@ -301,7 +301,7 @@ class Names:
         self.learn(dict(addresses))
 
     def add(self, peer: Address) -> None:
-        """Add a peer; blocks.
+        """Add a peer; blocks until its name is resolved.
 
         Raises:
             AddressError: its name cannot be resolved.

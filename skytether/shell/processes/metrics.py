@@ -44,8 +44,8 @@ class Metric(NamedTuple):
         return Exposed((PREFIX + self.name).removesuffix("_total"), self.help, self.kind)
 
     def add(self, exposed: Exposed, labels: Mapping[str, str], value: Any) -> None:
-        """Add a figure. A mode becomes one sample per mode, 1 for the present mode, otherwise 0;
-        another text becomes the label of a sample with value 1.
+        """Add a figure's value. A mode becomes one sample per mode, 1 for the present mode,
+        otherwise 0; any other text becomes the label of a sample with value 1.
         """
         name, labels = PREFIX + self.name, {**labels, **self.labels}
         if isinstance(value, str) and not self.figure.endswith("mode"):

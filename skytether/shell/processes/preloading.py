@@ -1,4 +1,4 @@
-"""Imports before a live process's first packet, of modules that a change in flight may need."""
+"""Import of modules that a change in flight may need, before a live process's first packet."""
 
 from collections.abc import Collection
 from contextlib import suppress
@@ -24,7 +24,7 @@ def preload(changeable: Collection[str]) -> None:
                 modules += [] if table[name].is_ours else [guarded]
     if "network.uplink" in changeable:
         modules.append("skytether.shared.base.folders")
-        with suppress(NotInstalledError):  # the package of queues
+        with suppress(NotInstalledError):  # the package for queues may be missing
             load("skytether.netem.bottleneck", "a change")
     if "armed" in changeable:
         modules.append("skytether.client.orders")

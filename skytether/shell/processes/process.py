@@ -118,7 +118,7 @@ class Process:
     """File of the endpoint's rows; at its end the process waits until they are written."""
     feed: "Feed | None"
     recorder: Recorder | None
-    """Recorder of the endpoint's rows, for a file, a feed or both; None for neither."""
+    """Recorder of the endpoint's rows, for a file, a feed or both; None without file and feed."""
 
     def fed(self, part: str, columns: np.dtype[np.void]) -> Recorder | None:
         """Recorder of a further part of the record, for the feed only; None without a feed."""
@@ -128,7 +128,7 @@ class Process:
         """The endpoint, wrapped to record its packets in the feed; itself without a feed."""
         if self.feed is None or self.secure is None:
             return endpoint
-        from skytether.shared.telemetry import ends  # loaded with the feed
+        from skytether.shared.telemetry import ends  # imported only with a feed
         from skytether.shell.driving.ends import Watched
 
         end = ends.End.CLIENT if self.name == "client" else ends.End.SERVER

@@ -1,7 +1,7 @@
 """Recording of a single process: a recorder process reads its feed and writes an MCAP file.
 
-The flying process does not wait for the disk, and imports no MCAP library. When it ends, or is
-killed, the recorder's standard input ends, and the recorder completes its file.
+The flying process does not wait for the disk, and imports no MCAP library. When the flying process
+ends or is killed, the recorder's standard input ends, and the recorder completes its file.
 """
 
 import subprocess

@@ -197,7 +197,7 @@ class Guard:
             newcomer.cut(TurnedAway.FULL)
 
     def _make_room(self, newcomer: sockets.ServerConnection, *, opened: bool = False) -> bool:
-        """End the connection silent longest, except the newcomer; returns whether there is one.
+        """End the longest silent connection other than the newcomer; returns whether there is one.
 
         Args:
             opened: whether the ended connection must be a websocket.

@@ -152,7 +152,7 @@ class Page:
             self._waiting.content = text
 
     def _reads(self, number: int) -> bool:
-        """Whether a browser has read everything that was sent; otherwise it gets nothing more."""
+        """Whether a browser has read everything that was sent; otherwise nothing more is sent."""
         connection = self._connections.get(number)
         return connection is not None and not connection.paused
 

@@ -24,7 +24,7 @@ TOKEN_BYTES = 16
 POLL_S = 0.1
 """Interval at which Ctrl-C is checked [s]."""
 PORTS, PORTS_TRIED = 65536, 100
-"""Number of existing ports, and number of ports tried, from the requested one on."""
+"""Number of existing ports, and number of ports tried, from the requested port on."""
 ANYWHERE = ("0.0.0.0", "::")
 """Wildcard addresses, which mean every interface; a browser cannot connect to them."""
 

@@ -50,7 +50,7 @@ def together(changed: Mapping[tuple[str, str], Changed], netems: int) -> str:
 
 
 def _where(changes: Sequence[tuple[str, Changed]], netems: int) -> str:
-    """Direction and path of changes of the network; empty if they apply to all."""
+    """Direction and path of changes of the network; empty if they apply to all paths both ways."""
     ways = {
         event.name.replace("_", " ") or DIRECTIONS[event.key]
         for _, event in changes

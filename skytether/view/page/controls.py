@@ -152,7 +152,7 @@ def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
 def _argument(
     name: str, unit: str, hint: str, at: str, low: float, high: float, step: float
 ) -> Knob:
-    """Slider for an argument of the trigger; integers only if the step is an integer."""
+    """Slider for an argument of the trigger; with a step of 1 or more, only integers."""
     key = f"control.trigger.{at}"
 
     def write(_: Values, number: float) -> dict[str, Any]:

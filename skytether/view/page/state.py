@@ -388,7 +388,7 @@ class State:
         """Length of the flight [s], from the client if it sends frames."""
         self.vehicles: dict[int, VehicleTrack] = {}
         self.omitted = 0
-        """Number of rows dropped because of more than VEHICLES_MAX vehicles."""
+        """Number of rows dropped because there are more than VEHICLES_MAX vehicles."""
         self._zones: str | None = None
         """Zones as changed in flight; None before a change."""
         self.network = Network(0)
@@ -587,7 +587,7 @@ class State:
 
     @property
     def has_zones(self) -> bool:
-        """Whether the flight has a fence or zones to avoid."""
+        """Whether the flight has a fence, or is a mission, which may have zones."""
         return self.scenario.fence.is_there or self.scenario.is_mission
 
     @property

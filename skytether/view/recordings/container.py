@@ -66,7 +66,7 @@ DAMAGES_MAX = 100
 CHUNK_BYTES_MAX = 5 * 1024 * 1024
 """Largest size of a decompressed chunk [B]; Skytether's have 256 KiB plus a message."""
 SPARE_BYTES = 16 * 1024 * 1024
-"""Total decompressed size of chunks that even a small file may have [B]."""
+"""Total decompressed size that the chunks of even the smallest file may have [B]."""
 RATIO_MAX = 50
 """Largest ratio of the chunks' total decompressed size to the file's size; flights have 3 to 5,
 because the index of messages is not compressed.

@@ -178,7 +178,7 @@ class Recording:
         self._draw("/events", "Log", foxglove.log(self._now_ns, process, str(event), level))
 
     def _put_rows(self, part: str, table: rows.RowTable, made: Table) -> None:
-        """Add a message for each row, for other programs, and messages that draw it."""
+        """For each row, add a message for other programs, and messages that draw the row."""
         for row, message in zip(made, table.messages(made), strict=True):
             number = int(row["vehicle"]) if "vehicle" in table.names else 0
             at = f"/vehicle/{number}/{_TOPICS.get(part, part)}" if number else f"/{part}/packets"
