@@ -35,16 +35,16 @@ class ExplainOptions:
     """A scenario's name (`skytether list scenarios`), a .toml file, or a recording (.mcap) of a
     flight in virtual time or over UDP."""
     at: Annotated[float | None, Argument(metavar="T")] = None
-    """Flight time at the moment to explain [s]; default: the most severe one."""
+    """Time of flight of the moment to explain [s]; by default of the most severe moment."""
     vehicle: Annotated[int | None, Argument(metavar="N")] = None
-    """Number of the vehicle whose moment is to be explained; by default any."""
+    """Number of the vehicle of the moment to explain; by default any vehicle."""
     seeds: Annotated[int, Argument(metavar="N")] = 0
-    """Number of flights of each remedy with other seeds, which count up from the scenario's."""
+    """Number of further seeds with which each remedy is flown: those after the scenario's seed."""
     vehicles: Annotated[int | None, Argument(metavar="N")] = None
-    """Number of vehicles, as in `skytether fleet`; by default one, or as many as a mission has. Not
-    with a recording."""
+    """Number of vehicles, as in `skytether fleet`; by default one, or all vehicles of a mission. A
+    recording has its own number."""
     json: Path | None = None
-    """File for the explanation, written after each step."""
+    """JSON file for the explanation, written again after each of its steps."""
     figure: Path | None = None
     """File for a picture of the explanation (.png, .pdf or .svg)."""
     pool: PoolFlags = Flags()
@@ -54,12 +54,12 @@ class ExplainOptions:
 def explain_flight(argv: Sequence[str]) -> None:
     """Fly a scenario in virtual time, and explain why something went wrong.
 
-    The same flight is flown again without its outages, lost and late packets, wind and noise, to
-    find the smallest set of them that suffices. Further flights show whether each is needed,
-    whether a single packet would have averted it, how long an outage must be, and what other keys
-    would change, over the same network and, with --seeds, with other seeds.
+    The flight is repeated without some of its outages, lost and late packets, wind and noise, to
+    find the smallest set of them with which the same happens. Further flights show whether each is
+    needed, whether one more delivered packet would have averted it, how long an outage must be, and
+    what other keys would change, over the same network and, with --seeds, with other seeds.
 
-    It explains this flight of a simulated vehicle, or the double of a recorded one. Ctrl-C prints
+    A recorded flight over UDP is replaced by its double, which flies in virtual time. Ctrl-C prints
     the explanation so far.
     """
     if argv and argv[0].endswith(RECORDING):
@@ -121,7 +121,7 @@ def _judge(options: ExplainOptions, recorded: Recorded) -> None:
 
 
 def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str | Track]:
-    """Name and case of a recorded flight; its hash, or the flight if the case is its double.
+    """Scenario's name and case of a recorded flight, and its hash; of a double the recorded track.
 
     Raises:
         CommandError: the flight cannot be flown again.
@@ -144,7 +144,7 @@ def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str
     """Explain a flight, and show the explanation even if it is incomplete.
 
     Args:
-        recorded: see `_recorded`; empty: the flight is not recorded.
+        recorded: hash or track from `_recorded`; empty if the flight is not recorded.
 
     Raises:
         CommandError: interrupted, or a file cannot be written.
@@ -176,7 +176,7 @@ def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str
                 if isinstance(recorded, str):
                     check_same(known.flown, recorded or known.flown.trace, options.scenario)
                 flyers.advance(1, step)
-                if options.json is not None:  # at once, for programs that show the progress
+                if options.json is not None:  # each time, for programs that show the progress
                     command.write(options.json, known.to_json(step))
         except Interrupted as error:
             interrupted = error

@@ -1,12 +1,12 @@
-"""What is a double's own in virtual time: when its ends are woken, its network and its vehicle.
+"""Parts of a double (`doubles`) in virtual time: wake-ups of both ends, its network, its vehicle.
 
-The impairment `doubled` has what happened to each packet. The vehicle `doubled` is a model in place
-of a real vehicle, pushed as that was:
+The impairment `doubled` repeats the recorded delay and loss of each packet. The vehicle `doubled`
+replaces a real vehicle by the model, plus a share of the recorded deviation from the model:
 
     x(k+1) = A x(k) + B u(k) + share · (x_r(k+1) - A x_r(k) - B u_r(k))
 
-x_r and u_r are the states and inputs of the recorded flight. With its inputs and all of the push it
-flies as recorded; without the push, as the model does in calm air.
+x_r and u_r are the states and inputs of the recorded flight. With the recorded inputs and share 1
+the vehicle flies as recorded; with share 0 it flies like the model in calm air.
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -35,11 +35,11 @@ from skytether.sim.flight import MIDNIGHT_NS, SERVER
 from skytether.sim.world import World
 
 FLOWN: list[Double] = []
-"""The recorded flight of the next vehicle: a scenario has no arrays."""
+"""Recorded flight for the next vehicle `doubled`; global, as a scenario cannot contain arrays."""
 
 
 def actions(double: Double, scenario: Scenario) -> Iterator[tuple[float, Callable[[World], None]]]:
-    """What makes a flight in virtual time a double, with the times in it [s]."""
+    """Actions that make a flight in virtual time a double, each with its time of flight [s]."""
     FLOWN[:] = [double]
     client = f"client {scenario.seed}.1"
     if not double.sends_first:
@@ -51,7 +51,7 @@ def actions(double: Double, scenario: Scenario) -> Iterator[tuple[float, Callabl
 
 
 def _keep_silent(world: World, host: str) -> None:
-    """Let a client send nothing at step 0, as one does that first saves that it has begun (see
+    """Let a client send nothing at step 0, like a client that must first save its state (see
     `client.memory`).
     """
     client: Any = world.endpoint(host)
@@ -68,7 +68,7 @@ def _wake_late(world: World, host: str, late_ns: Mapping[int, int]) -> None:
 
 
 class Late(Steady):
-    """Endpoint that is woken late, as its process was; where that is not known, as it usually was.
+    """Endpoint that is woken as late as the recorded process; by default, by the median lateness.
 
     Args:
         late_ns: see `Double`.
@@ -81,14 +81,14 @@ class Late(Steady):
 
     def next_wake_ns(self) -> int | None:
         due_ns = super().next_wake_ns()
-        if due_ns is None or due_ns < MIDNIGHT_NS:  # at once
+        if due_ns is None or due_ns < MIDNIGHT_NS:  # no wake, or one at once
             return due_ns
         return due_ns + self._late_ns.get(due_ns - MIDNIGHT_NS, self._usual_ns)
 
 
 @impairment(name="doubled")
 class DoubledPath(Trace):
-    """Delays and loses packets as those of a recorded flight, each by its slot and rank."""
+    """Delays or loses each packet like the recorded packet with the same slot and rank."""
 
     def __init__(self, file: File) -> None:
         super().__init__(file, "once")
@@ -99,7 +99,7 @@ class DoubledPath(Trace):
         }
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
-        """Apply the fate of the packet sent then; between packets as `trace`."""
+        """Apply the fate of the recorded packet; between recorded packets, interpolate."""
         if (known := self._fates.get((fate.slot, fate.rank))) is None:
             super().__call__(fate, draws)
             return
@@ -108,7 +108,7 @@ class DoubledPath(Trace):
 
 
 class PushedPlant(FirstOrderPlant):
-    """Plant in calm air that begins where the recorded vehicle did."""
+    """Plant in calm air that starts in the recorded vehicle's state and is pushed as recorded."""
 
     def __init__(self, scenario: Scenario, flown: Double, share: float) -> None:
         super().__init__(scenario, Weather(scenario, stream(scenario.seed, "calm")))
@@ -131,7 +131,7 @@ class PushedPlant(FirstOrderPlant):
 
 
 class Ground(Endpoint):
-    """Port of a vehicle that is in the air at a given time of its clock."""
+    """Port of a vehicle that is in the air from a given time of its clock on."""
 
     def __init__(self, up_ns: int) -> None:
         super().__init__()
@@ -139,7 +139,7 @@ class Ground(Endpoint):
         self.is_up = False
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Nothing is received."""
+        """Ignore the datagram: nobody sends to this port."""
 
     def wake(self, *, now_ns: int) -> None:
         self.is_up |= now_ns > self._up_ns
@@ -149,7 +149,7 @@ class Ground(Endpoint):
 
 
 class Doubled(SimulatedVehicle):
-    """A real vehicle's double: it takes off when that had taken off."""
+    """Vehicle in place of a real vehicle; it takes off at the time recorded for that vehicle."""
 
     drifts = True
     port: Ground
@@ -164,7 +164,7 @@ def doubled(
     number: int,  # noqa: ARG001
     share: Annotated[float, Meta(ge=0, le=1)] = 1.0,
 ) -> Doubled:
-    """The model of a real vehicle, with a share of what pushed that in a recorded flight."""
+    """Model of a real vehicle, plus a share of that vehicle's recorded deviation from the model."""
     sensor, (flown,) = Sensor(scenario, stream(scenario.seed, "sensor")), FLOWN
     made = Doubled(scenario.dt_ns, PushedPlant(scenario, flown, share), sensor)
     made.port = Ground(MIDNIGHT_NS + flown.began_ns - 1)

@@ -1,15 +1,15 @@
-"""Doubles: a flight over UDP, flown again in virtual time with what its packets met.
+"""Doubles: flights over UDP, flown again in virtual time over the recorded fates of their packets.
 
-    rows of both ends → when they were woken, fates of packets (`doubled`) → a `FlightCase`
+    rows of both ends → lateness of wake-ups, fates of packets (`doubled`) → a `FlightCase`
 
-The double has the scenario, the seed and the session's opening of the recording. Both ends are
-woken as late as they were, and packets are lost or delayed as those sent at the same time were: one
-between two recorded ones is lost if the nearer was, and has a delay between theirs. So each packet
-is handled before the tick before which it was; `in_force` and `observed_step` follow from that.
+The double has the recording's scenario, seed and time at which the session opened. Both ends are
+woken as late as recorded. A packet has the fate of the recorded packet of the same time; between
+two recorded packets its delay is interpolated, and its loss is that of the nearer. So each packet
+is handled before the same tick as recorded, and `in_force` and `observed_step` are as recorded.
 
-**A real vehicle** is replaced by the model that flew with it, pushed at each step by what that left
-unexplained (`doubled`). What it would have done with other inputs is less certain: the wind
-elsewhere, and errors of the model.
+**A real vehicle** is replaced by the scenario's model, pushed at each step by the recorded
+deviation from the model (`doubled`). What the vehicle would have done with other inputs is less
+certain, because of wind in other places and errors of the model.
 """
 
 from collections import Counter, defaultdict
@@ -39,27 +39,27 @@ from skytether.shared.telemetry.record import Rows
 from skytether.shared.telemetry.summary import WORSE
 from skytether.sim.flight import MIDNIGHT_NS
 
-if TYPE_CHECKING:  # it needs the library of MCAP
+if TYPE_CHECKING:  # the module needs the library of MCAP
     from skytether.view.recordings.recorded import Recorded
 
 NEAR_M = 0.1
-"""Largest distance of a double from its recording, up to the moment, with which it explains [m]."""
+"""Largest distance of a double from its recording before the moment; else it is refused [m]."""
 NOWHERE = 2**16 - 1
-"""Path of packets of others."""
+"""Number for the path of packets that the server exchanged with others than the client."""
 SENT = Happened.SENT
 ENDS: tuple[Literal["client", "server"], ...] = ("client", "server")
 ASIDE_NS = 5 * MILLISECOND_NS
-"""Time after a stall within which packets that came meanwhile are handled [ns]."""
+"""Time after a stall within which packets that arrived during the stall are handled [ns]."""
 SIMULATED = "simulated", "quadrotor"
-"""Kinds of vehicles that fly the same again, from their seed."""
+"""Kinds of simulated vehicles, whose flight the seed repeats; others are replaced by a model."""
 
 
 @dataclass(frozen=True, slots=True)
 class Nearness:
-    """Largest distances of a double from its recording, at equal steps, once settled [m]."""
+    """Largest distances of a double from its recording at equal steps, after the settling time."""
 
     until_m: float
-    """Up to the beginning of the moment; of a flight without one, in the whole flight."""
+    """Largest distance until the moment begins; without a moment, in the whole flight [m]."""
     whole_m: float
 
     def __str__(self) -> str:
@@ -69,7 +69,7 @@ class Nearness:
 
 
 def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
-    """The case that is the double of a recorded flight, and that flight itself.
+    """Case of the double of a recorded flight, and track of the recorded flight.
 
     Raises:
         ConfigError: the recording does not have what a double needs.
@@ -77,7 +77,7 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
     scenario, dt_ns, rows = recorded.scenario, recorded.scenario.dt_ns, recorded.parts["client"]
     client, server = ends = _ends(recorded)
     began_ns = _began_ns(recorded, client)
-    # Time in the flight, as that of events, plus less than a step: so the server's ticks are due.
+    # The flight's time 0, up to a step before the recording's: so ticks are due at recorded ticks.
     tick_ns = int(_of(server, Happened.WOKEN)["due_ns"][-1])
     zero_ns = recorded.begin_ns - (recorded.begin_ns - tick_ns - MIDNIGHT_NS) % dt_ns
     compute_ns = _compute_ns(server)
@@ -102,7 +102,7 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
         gone = (changes for name, changes in SETTINGS if name != COMPUTING)
         keys |= dict(chain.from_iterable(gone))
         keys["vehicle.kind"] = DOUBLED
-    # Just before step 0, whose lateness has this time, the vehicle is in the air.
+    # The vehicle's port is due 1 ns before step 0 and woken 1 ns late: then it is in the air.
     late_ns[0][began_ns - zero_ns - 1] = 1
     opens_s, (states, inputs) = (opens_ns[0] - zero_ns) / SECOND_NS, _steps(rows)
     sends = bool((client["due_ns"][_causes(client)[client["happened"] == SENT]] == began_ns).any())
@@ -124,7 +124,7 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
 
 
 def _ends(recorded: "Recorded") -> tuple[Rows, Rows]:
-    """Rows of the client's end and of the server's, whose peers are numbers of paths."""
+    """Rows of the client's end and of the server's end; `peer` is the number of a path in both."""
     parts = recorded.parts
     rows = parts.get(PART, np.empty(0, COLUMNS))
     client, server = (rows[rows["end"] == end] for end in (End.CLIENT, End.SERVER))
@@ -141,8 +141,8 @@ def _ends(recorded: "Recorded") -> tuple[Rows, Rows]:
 
 
 def _on_paths(client: Rows, server: Rows) -> Rows:
-    """The server's rows with the client's numbers of paths for its own, by the packets sent once;
-    the client numbers its paths in the order in which it uses them first.
+    """The server's rows with the client's path numbers as `peer`, found by the packets that were
+    sent only once; the client numbers its paths in the order of their first use.
     """
     both = Counter[tuple[int, int]]()
     for sender, receiver in ((client, server), (server, client)):
@@ -169,7 +169,7 @@ def _of(rows: Rows, happened: Happened) -> Rows:
 
 
 def _began_ns(recorded: "Recorded", client: Rows) -> int:
-    """Time of step 0: of the wakes near the event, the one that most others follow by steps."""
+    """Time of step 0 [ns]: the wake near `Flying` that most wakes follow by a multiple of dt."""
     times_ns = (at_ns for at_ns, _, event in recorded.events() if isinstance(event, Flying))
     flying_ns, dt_ns = recorded.begin_ns + next(times_ns, 0), recorded.scenario.dt_ns
     due_ns = _of(client, Happened.WOKEN)["due_ns"]
@@ -182,19 +182,19 @@ def _began_ns(recorded: "Recorded", client: Rows) -> int:
 
 
 def _causes(rows: Rows) -> Indices:
-    """Number of the row to which each answers: itself, unless something was sent."""
+    """Number of the wake or arrival that caused each row; for wakes and arrivals the row itself."""
     is_sent = rows["happened"] == SENT
     return np.maximum.accumulate(np.where(is_sent, 0, np.arange(len(rows))))
 
 
 def _arrivals(sender: Rows, receiver: Rows) -> dict[int, int]:
-    """Number of the receiver's row for each of the sender's rows of a packet that arrived."""
+    """Number of the receiver's row by number of the sender's row, of packets that arrived."""
     sent, found = defaultdict[tuple[int, int], list[int]](list), dict[int, int]()
     for number in np.flatnonzero(sender["happened"] == SENT).tolist():
         sent[_packet(sender[number])].append(number)
     for number in np.flatnonzero(receiver["happened"] == Happened.RECEIVED).tolist():
         equal = sent[_packet(receiver[number])]
-        # Of equal packets, such as those that ask for a session, the newest before it.
+        # Of identical packets, such as repeated HELLOs, the newest one sent before the arrival.
         before = sum(sender["time_ns"][each] <= receiver["time_ns"][number] for each in equal)
         if equal:
             found[equal.pop(max(0, before - 1))] = number
@@ -202,12 +202,12 @@ def _arrivals(sender: Rows, receiver: Rows) -> dict[int, int]:
 
 
 def _packet(row: np.void) -> tuple[int, int]:
-    """Path and hash of a packet, of which a copy may go over each path."""
+    """Path and hash of a packet; its copies on several paths have the same hash."""
     return int(row["peer"]), int(row["packet"])
 
 
 def _compute_ns(server: Rows) -> int:
-    """Median time from a tick to what it sends [ns]."""
+    """Median time from a tick of the server until its packets are sent [ns]."""
     cause = _causes(server)
     is_it = (server["happened"] == SENT) & (server["happened"][cause] == Happened.WOKEN)
     passed_ns = (server["time_ns"] - server["time_ns"][cause])[is_it]
@@ -215,7 +215,7 @@ def _compute_ns(server: Rows) -> int:
 
 
 def _late_ns(rows: Rows) -> dict[int, int]:
-    """How late an end was woken, by the time at which it should have been [ns]."""
+    """Lateness of each wake-up of an end [ns], by the time at which the wake-up was due [ns]."""
     woken = _of(rows, Happened.WOKEN)
     late_ns = woken["time_ns"] - woken["due_ns"]
     return dict(zip(woken["due_ns"].tolist(), late_ns.tolist(), strict=True))
@@ -230,12 +230,12 @@ def _fates(
     compute_ns: int,
     stood_ns: Sequence[tuple[int, int]],
 ) -> File:
-    """File of what happened to the packets of a path and direction, for `doubled`.
+    """File for `doubled`: delay and loss of each packet of a path and direction.
 
     Args:
-        opens_ns: time at which the path's first packet is sent, from which the file counts.
-        compute_ns: time after which what a tick sends leaves.
-        stood_ns: times at which the receiver stood still, and for how long.
+        opens_ns: time at which the path's first packet is sent; times in the file count from it.
+        compute_ns: time from a tick until its packets are sent.
+        stood_ns: beginning and length of each stall of the receiver.
     """
     cause, came = _causes(sender), _arrivals(sender, receiver)
     is_tick = sender["happened"][cause] == Happened.WOKEN
@@ -258,7 +258,7 @@ def _fates(
 
 
 def _with_fates(scenario: Scenario, fates: Sequence[File], keys: Mapping[str, Any]) -> Scenario:
-    """Scenario with changed keys, whose paths have the fates in files: up and down of each."""
+    """Scenario with changed keys and two files of fates for each path: uplink, then downlink."""
     texts = [f"doubled({each.name})" for each in fates]
     network = scenario.network
     paths = tuple(
@@ -275,7 +275,7 @@ def _with_fates(scenario: Scenario, fates: Sequence[File], keys: Mapping[str, An
 
 
 def _steps(client: Rows) -> tuple[Array, Array]:
-    """States and inputs of all steps; of missed ones those between, and the input before them."""
+    """States and inputs of all steps; a missed step has an interpolated state, the last input."""
     step, states = client["step"], client["state"]
     steps = np.arange(int(step[-1]) + 1)
     columns = [np.interp(steps, step, each) for each in states.reshape(len(states), -1).T]
@@ -287,13 +287,13 @@ def _steps(client: Rows) -> tuple[Array, Array]:
 def nearness(
     flown: CaseOutcome, recorded: Track, moment: Moment | None, settled_s: float
 ) -> Nearness:
-    """How near a double is to its recording.
+    """Distances of a double from its recording.
 
     Args:
-        settled_s: time since step 0 from which on it counts [s].
+        settled_s: time since step 0 from which on distances count [s].
 
     Raises:
-        ConfigError: too far to explain it.
+        ConfigError: the double does not fly, is too far away, or brakes at another time.
     """
     if not flown.tracks:
         raise ConfigError("its double does not fly")
@@ -308,11 +308,11 @@ def nearness(
         departs_s = time_s[np.argmax(distance_m > NEAR_M)]
         raise ConfigError(
             f"its double is {near.until_m:.2f} m away before the moment, expected at most "
-            f"{NEAR_M} m: it departs at {departs_s:.2f} s, by something that is not recorded, such "
-            "as what a pilot did, or another process"
+            f"{NEAR_M} m: it departs at {departs_s:.2f} s, because of something that is not "
+            "recorded, such as a pilot's commands or another process"
         )
     around = np.abs(recorded.time_s - moment.start_s) <= AROUND_S if moment else np.array([])
     if moment and moment.kind == "brake" and not np.isin(recorded.mode[around], WORSE).any():
         says = f"its double {moment.says} at {moment.start_s:.2f} s"
-        raise ConfigError(f"{says}, which the recorded flight did not")
+        raise ConfigError(f"{says}, unlike the recorded flight")
     return near

@@ -17,7 +17,7 @@ from skytether.shared.base.errors import ConfigError
 AT_MAX_S = 2.0
 """Largest distance of a moment from the requested time [s]."""
 CURVES_MAX = 2
-"""Largest number of drawn flights without a part of the cause."""
+"""Largest number of flights without a part of the cause that the picture shows."""
 STEPS = 6
 """Number of steps of an explanation, not counting flights of other seeds."""
 FIRST = "what went wrong"
@@ -26,7 +26,7 @@ FIRST = "what went wrong"
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Explanation of a flight so far; None for results of later steps."""
+    """Explanation of a flight so far; results of steps that are not finished are None."""
 
     name: str
     """Name of the scenario."""
@@ -42,7 +42,7 @@ class Explanation:
     remedies: tuple[Remedy, ...] | None = None
     """Flights with other keys; the first is the explained flight."""
     nearness: Nearness | None = None
-    """Distance of the double of a recorded flight from it; None for a flight in virtual time."""
+    """Distances of a double from the recorded flight; None for a flight in virtual time."""
     curves: tuple[tuple[str, CaseOutcome], ...] = ()
     """Flights drawn for comparison: without a part of the cause, and with a remedy."""
 
@@ -53,8 +53,8 @@ class Explanation:
         return f"{said}\n\n{of_mission}" if (of_mission := self.flown.judgement) else said
 
     def to_json(self, following: str = "") -> bytes:
-        """The explanation so far, as JSON: fields without flights, figures of a mission, text, and
-        name of the next step, which is empty at the end.
+        """The explanation so far as JSON: its fields except the flights, a mission's judgement, the
+        text, and as `next` the name of the next step, empty at the end.
         """
         names = "name", "seed", "moments", "moment", "nearness", "cause", "rescues", "remedies"
         fields = {name: getattr(self, name) for name in names}
@@ -81,7 +81,7 @@ def explain(
         vehicle: vehicle of the moment to explain; None: any.
         seeds: number of flights of each remedy with other seeds.
         at_once: number of flights that `fly_all` flies side by side.
-        recorded: the flight that the case is the double of.
+        recorded: track of the recorded flight, if the case is its double.
 
     Raises:
         ConfigError: there is no moment at that time, or the double is too far from the recording.
@@ -143,15 +143,15 @@ def _chosen(
         raise ConfigError(f"at: got {at_s:g}, expected {expected}{because}")
 
     def order(each: Moment) -> tuple[float, float, int]:
-        # Times are printed in tenths of a second; if several moments fit, take the one that begins
-        # then.
+        # Times are printed in tenths of a second; of several moments near a printed time, take the
+        # moment that begins at that time.
         return round(distance_s(each), 1), round(abs(each.start_s - at_s), 1), -WEIGHTS[each.kind]
 
     return min(near, key=order)
 
 
 def _curves(cause: Cause, without: Sequence[CaseOutcome]) -> tuple[tuple[str, CaseOutcome], ...]:
-    """Label and outcome of flights without one needed part of a cause, at most CURVES_MAX."""
+    """Label and outcome of at most CURVES_MAX flights, each without one needed part of a cause."""
     needed = [
         (f"without the {causes.named(part.unit)}", each)
         for part, each in zip(cause.parts, without, strict=True)
@@ -203,5 +203,5 @@ def check_same(flown: CaseOutcome, trace: str, name: str) -> None:
         ConfigError: the hashes differ; the message names the flight.
     """
     if flown.trace != trace:
-        expected = "one in virtual time by this version, without changes or faults"
+        expected = "a flight in virtual time by this version, without changes or faults"
         raise ConfigError(f"{name}: its flight cannot be reproduced, expected {expected}")

@@ -1,4 +1,4 @@
-"""`fly` flies a case in virtual time, and returns the outcome. No other module here flies.
+"""`fly` flies a case in virtual time and returns its outcome; only this module of `explain` flies.
 
 A case and its outcome can be sent to another process and back.
 """
@@ -29,8 +29,8 @@ from skytether.theorem.judgement import Judgement, judged
 from skytether.theorem.waits import Reason, questions
 
 JUST_NS, BEFORE_NS = SECOND_NS // 5, 2 * SECOND_NS
-"""Least and largest age of packets by which it is judged whether a path was dead [ns]: those that
-were sent just before may be under way."""
+"""Least and largest age of the packets that show whether a path was dead [ns]; newer packets may
+still be under way."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,16 +70,16 @@ class Packets:
 
 
 class Death(NamedTuple):
-    """Time at which an end took a path for dead."""
+    """Decision of the vehicle or the server that a path is dead."""
 
     time_s: float
     """Time of flight [s]."""
     vehicle: int
     path: int
     direction: int
-    """UPLINK, which the server judges by reports, or DOWNLINK, which the vehicle hears."""
+    """Direction in which the deciding end sends: UPLINK: the server; DOWNLINK: the vehicle."""
     arrived: float
-    """Share of the packets sent over it shortly before that arrived."""
+    """Share of the packets sent over the path shortly before the decision that arrived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,8 @@ class CaseOutcome:
     trace: str
     """Hash of the vehicles' rows, see `trace_hash`."""
     judgement: Judgement | None = None
-    """Whether what the theorem of separation assumes held, and who waited; None unless on a
-    mission."""
+    """Whether the assumptions of the separation theorem held, and which vehicle waited for which;
+    None without a mission."""
 
 
 FlyAll: TypeAlias = Callable[[Sequence[FlightCase]], list[CaseOutcome]]
@@ -148,7 +148,7 @@ def _actions(stall: Stall, case: FlightCase) -> Iterable[tuple[float, Callable[[
 
 
 def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) -> CaseOutcome:
-    """Outcome of a recorded flight in virtual time; `reasons`: see `waits`."""
+    """Outcome of a flight in virtual time, from its record; `reasons`: see `waits`."""
     began_ns = _lanes_began_ns(record)
     flying_ns = {
         each.event.vehicle: each.time_ns for each in record.events if isinstance(each.event, Flying)
@@ -182,7 +182,7 @@ def outcome(scenario: Scenario, record: Record, reasons: Sequence[Reason] = ()) 
 
 
 def track(scenario: Scenario, rows: Rows, server: Rows, vehicle: int, began_s: float) -> Track:
-    """Track of a vehicle from its rows, and from the server's."""
+    """Track of a vehicle, from its own rows and the server's rows."""
     flown = rows[np.argmax(rows["mode"] == Mode.TRACK) :]
     if scenario.keeps_apart:  # on a mission the reference is the next goal, which is far away
         error_m = np.zeros(len(flown))
@@ -220,7 +220,7 @@ def _lanes_began_ns(record: Record) -> dict[Lane, int]:
 
 
 def _packets(scenario: Scenario, record: Record, began_ns: Mapping[Lane, int]) -> Packets:
-    """Packets by time."""
+    """Packets of a flight, in the order in which they entered the network."""
     rows = record.netem[np.argsort(record.netem["arrived_ns"], kind="stable")]
     names = rows["path"].tolist(), rows["direction"].tolist(), rows["flow"].tolist()
     lanes: list[Lane] = list(zip(*names, strict=True))

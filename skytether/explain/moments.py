@@ -2,14 +2,14 @@
 
     failure      a vehicle could not fly, or not to the end
     brake        a vehicle brakes, lands or stands still, until it follows a plan again
-    error        its distance from the reference is far above that of the perfect flight
-    separation   two vehicles of a mission came as close as they may, or closer
+    error        a vehicle is much farther from its reference than in the perfect flight
+    separation   two vehicles of a mission came nearly within the required separation, or closer
     packets      the server sends far more packets in a second than in the perfect flight
     path         a path was taken for dead although most of its packets arrived
 
 The perfect flight has the same reference and wind, every packet arrives at once, and nothing else
-is wrong (`units.perfect`). A comparison with the flight's own median would hide a flight that is
-always bad.
+is wrong (`units.perfect`). The flight's own median would be no good comparison: in a flight that is
+bad throughout, nothing would exceed it.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,20 +29,20 @@ from skytether.shared.wire.protocol import Mode
 FAR_TIMES = 3.0
 """An error is large above this multiple of the usual error, plus `FAR_STEPS`."""
 FAR_STEPS = 2.0
-"""Second part of that bound, in steps at full speed: less is corrected in a step or two."""
+"""Added to the bound on errors, in steps at full speed: two steps correct any smaller error."""
 AROUND_S = 1.0
-"""Time before and after a step in which the usual error is the perfect flight's largest [s]."""
+"""The usual error at a step is the perfect flight's largest within this time of the step [s]."""
 AFTER_S = 5.0
-"""Time after a moment within which the resulting error is largest [s]."""
+"""Time after a moment within which its largest error is searched for [s]."""
 PAUSE_S = 1.0
-"""Time before and after a large error for which the moment goes on [s]."""
+"""A moment lasts while the error exceeds half its bound within this time before or after [s]."""
 NEAR = 1.05
-"""Distances below this multiple of the separation are near it."""
+"""Two vehicles are too near below this multiple of the required separation."""
 WASTED_TIMES, WASTED_PER_S = 3.0, 10.0
-"""Packets are wasted above this multiple of the perfect flight's rate, and this excess [1/s]."""
+"""Plans are wasted above this multiple of the perfect flight's rate, and this excess [1/s]."""
 
 ALIVE = 0.5
-"""Share of its packets that arrived above which a path was not dead."""
+"""A path was not dead if a larger share of its packets arrived."""
 WARM_S = 5.0
 """Time of flight before which many plans are normal, because vehicles have just started [s]."""
 
@@ -55,7 +55,7 @@ class Moment:
 
     kind: Kind
     vehicle: int
-    """Vehicle, from 1; 0 for all of them together."""
+    """Number of the vehicle, from 1; 0 for all vehicles together."""
     start_s: float
     """Time of flight at the beginning, counted as in events [s]."""
     end_s: float
@@ -66,10 +66,10 @@ class Moment:
     usual: float
     """The same figure of the perfect flight."""
     level: float
-    """Value of `measured` from which the moment occurs in another flight."""
+    """Least value of `measured` with which the moment occurs in another flight."""
     calm: float
-    """Value of `measured` below which the moment is clearly averted: a quarter of the excess over
-    `usual`; `level` is half of it."""
+    """Largest value of `measured` with which the moment is clearly averted: `usual` plus a quarter
+    of the excess. `level` is `usual` plus half of the excess."""
 
 
 def moments(flown: CaseOutcome, perfect: CaseOutcome, scenario: Scenario) -> list[Moment]:
@@ -108,14 +108,14 @@ WEIGHTS: Mapping[Kind, int] = {
 
 
 def measured(moment: Moment, outcome: CaseOutcome) -> float:
-    """Size of a moment in another flight; from `moment.level` on, it occurs there."""
+    """Size of a moment in another flight; the moment occurs there if it reaches `moment.level`."""
     around = moment.start_s - AROUND_S, moment.end_s + AROUND_S
     match moment.kind:
         case "failure":
             size = float(bool(outcome.failure))
         case "brake":
             track, size = _track(outcome, moment.vehicle), 1.0
-            if track is not None:  # else the vehicle never flew
+            if track is not None:  # None: the vehicle never flew
                 size = float(np.isin(track.mode[_within(track.time_s, *around)], WORSE).sum())
         case "error":
             size = error_m(moment, outcome)
@@ -134,13 +134,13 @@ def comes_about(moment: Moment, outcome: CaseOutcome) -> bool:
 
 
 def is_averted(moment: Moment, outcome: CaseOutcome) -> bool:
-    """Whether the moment is clearly averted in a flight, not just below `moment.level`."""
+    """Whether a flight clearly averts the moment: `measured` is at most `moment.calm`."""
     return measured(moment, outcome) <= moment.calm
 
 
 def error_m(moment: Moment, outcome: CaseOutcome) -> float:
-    """Largest error during the moment and shortly after it [m]: of its vehicle, or of all if that
-    is 0.
+    """Largest error during the moment and shortly after it [m], of the moment's vehicle, or of all
+    vehicles if its number is 0.
     """
     errors = [
         track.error_m[_within(track.time_s, moment.start_s - AROUND_S, moment.end_s + AFTER_S)]
@@ -236,7 +236,7 @@ def _rate(outcome: CaseOutcome, start_s: float, end_s: float) -> float:
 
 
 def _runs(begin: Flags, goes_on: Flags) -> list[tuple[int, int]]:
-    """First index and end of each stretch, which begins at `begin` and lasts while `goes_on`."""
+    """First index and end of each stretch: it begins at `begin`, and lasts while `goes_on`."""
     runs, at = [], 0
     while at < len(begin) and begin[at:].any():
         first = at + int(np.argmax(begin[at:]))

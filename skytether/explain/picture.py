@@ -1,4 +1,4 @@
-"""Picture of an explanation: errors above, packets and outages of each lane below."""
+"""Picture of an explanation: errors above, packets and outages of each path and direction below."""
 
 from typing import TYPE_CHECKING
 

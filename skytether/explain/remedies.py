@@ -1,8 +1,8 @@
 """Remedies: the same flight with other keys over the same network, and flights of other seeds.
 
-The list depends on the cause. If the network is part of it: keys of what is sent, how often and
-over which paths, of time-outs and of the horizon. If estimate, filter or model are: their keys. A
-remedy costs packets, and averting a brake may increase the error: both are shown.
+The keys depend on the cause. For the network they set what is sent, how often and over which paths,
+the time-outs and the horizon; for wind, sensors or the model, the estimate, the filter or the
+model. A remedy may cost packets, or avert a brake but increase the error: both are shown.
 """
 
 from collections.abc import Iterator, Sequence
@@ -44,7 +44,7 @@ class Remedy:
     name: str
     keys: Keys
     averts: bool
-    """Whether the moment does not occur."""
+    """Whether the keys avert the moment."""
     brakes: int
     """Number of brakes, landings and faults in the whole flight."""
     error_m: float
@@ -87,7 +87,7 @@ def with_others(each: Remedy, case: FlightCase, seeds: Sequence[int], fly_all: F
 
 
 def _with(case: FlightCase, name: str, keys: Keys) -> FlightCase:
-    """Whole flight with a remedy."""
+    """Case of the whole flight with a remedy."""
     return replace(case, keys=keys, standby=case.standby or name == STANDBY, until_s=None)
 
 
@@ -103,10 +103,10 @@ def _largest_m(outcome: CaseOutcome, scenario: Scenario) -> float:
 
 
 def possible(found: Cause, case: FlightCase) -> Iterator[tuple[str, Keys]]:
-    """Names and keys of remedies that the scenario can be flown with."""
+    """Names and keys of the remedies that change the scenario and can be flown."""
     for name, keys in _listed([part.unit for part in found.parts], case.scenario):
         if case.double and (name == STANDBY or any(key == "network.paths" for key, _ in keys)):
-            continue  # a second network is not recorded
+            continue  # a recording has one network only
         if not is_possible(case, keys):
             continue
         if replace(case, keys=keys).flown() != case.scenario or (
@@ -157,7 +157,7 @@ def _listed(units: Sequence[Unit], scenario: Scenario) -> Iterator[tuple[str, Ke
     if any("model" in name for name in names):
         yield "the model identified", _identified(scenario)
     stalled = {each.process for each in units if isinstance(each, Stall)}
-    can_stand_by = 3 * (link.fixed_ns or 0) <= seconds_to_ns(link.timeout_s)  # `client.several`
+    can_stand_by = 3 * (link.fixed_ns or 0) <= seconds_to_ns(link.timeout_s)  # see `client.several`
     if "server" in stalled and can_stand_by:
         yield STANDBY, Keys()
     if stalled:

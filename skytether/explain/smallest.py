@@ -20,7 +20,7 @@ def smallest(
     """Smallest set of units that suffices, in order; the complete set is assumed to suffice.
 
     Args:
-        suffice: whether each of several sets suffices; called often, never with all units.
+        suffice: returns whether each of several sets suffices; called often, never with all units.
         at_once: number of sets that are tried at once, for example in as many processes. The
             result does not depend on it.
     """

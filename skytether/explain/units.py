@@ -1,8 +1,8 @@
-"""Units of a cause, which can be removed from a flight; flights with or without some of them.
+"""Units that can be removed from a flight to find a cause; flights with or without some of them.
 
-The network is a function of time, which is evaluated every millisecond for each lane, so that
-outages without packets are found, too. For losses and delays shorter than OUTAGE_MS, each affected
-packet is a unit.
+The fate of a packet is known for every millisecond of each lane, whether or not a packet was sent,
+so outages without packets are found, too. Shorter than OUTAGE_MS, each lost or late packet is a
+unit.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -31,16 +31,16 @@ from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 
 OUTAGE_MS = 50
-"""Shortest stretch without a good slot that is an outage [ms]: by chance, independent losses of
-0.6 last that long once in 10¹¹ slots."""
+"""Shortest stretch without a good slot that counts as an outage [ms]. Independent losses with
+probability 0.6 last that long once in 10¹¹ slots."""
 STRIDE_MS = OUTAGE_MS // 2
 """Interval between slots that are tested for outages [ms]."""
 SPREAD = 3.0
-"""A packet is late beyond the median delay by this multiple of the distance to the upper quartile.
-"""
+"""A packet is late if its delay exceeds the median delay by more than this multiple of the distance
+from the median to the upper quartile."""
 
 KEYS_MAX = 5
-"""Largest number of overridden keys that are units by themselves: all combinations are checked."""
+"""Largest number of overridden keys that are separate units, as every combination is checked."""
 
 WIND, COMPUTING = "wind", "the server's computing time"
 SETTINGS: Sequence[tuple[str, Keys]] = (
@@ -70,16 +70,16 @@ SETTINGS: Sequence[tuple[str, Keys]] = (
         ),
     ),
 )
-"""Properties of vehicle, wind and server, and values of keys that remove them; wind, which most
-flights have, is last."""
+"""Properties of vehicle, wind and server, each with the values of keys that remove it. Wind is
+last, because most flights have it."""
 DOUBLED = "doubled(1)"
-"""Kind of the vehicle in place of a real one, see `doubled`."""
+"""Kind of the vehicle that replaces a real vehicle, see `doubled`."""
 PUSH = Setting("wind and errors of the model", (("vehicle.kind", "doubled(0)"),))
 
 
 def perfect(case: FlightCase) -> FlightCase:
-    """Case in which every packet arrives without delay and nothing else is wrong; same wind without
-    gusts.
+    """Case in which every packet arrives without delay and nothing else is wrong; its wind is the
+    same, without gusts.
     """
     network, none = case.scenario.network, {"uplink": "none", "downlink": "none"}
     paths = tuple(msgspec.structs.replace(each, **none) for each in network.paths)
@@ -102,7 +102,7 @@ class Circumstances:
     units: tuple[Unit, ...]
     """Units in an order in which related units are neighbours."""
     window: tuple[Stretch, ...]
-    """Stretch of each lane in which packets may be delivered; outside, nothing is changed."""
+    """Stretch of each lane in which units may be removed; outside it the network stays the same."""
     usual_s: dict[tuple[int, int], float]
     """Longest usual delay of a path and direction [s]."""
 
@@ -134,7 +134,7 @@ class Circumstances:
 
 
 def _between(stretch: Stretch, bad: Collection[Bad]) -> Iterator[Stretch]:
-    """Parts of a stretch outside bad ones."""
+    """Parts of a stretch that lie outside the bad stretches."""
     first = stretch.first
     for each in sorted(bad, key=lambda each: each.first):
         if each.lane == stretch.lane and each.end > first and each.first < stretch.end:
@@ -170,7 +170,7 @@ def circumstances(
 
 
 def _order(lane: Lane) -> tuple[int, int, int]:
-    """Sort key of lanes: downlinks first, which matter less, then uplinks."""
+    """Sort key of lanes: downlinks first, because they matter less, then uplinks."""
     path, direction, flow = lane
     return -direction, flow, path
 
@@ -187,12 +187,12 @@ def _usual_s(flown: CaseOutcome, lane: Lane) -> float:
 
 
 def _settings(case: FlightCase) -> Iterator[Setting]:
-    """Overridden keys of a scenario, and what of SETTINGS it has."""
+    """Overridden keys of a scenario, and those of SETTINGS that it has, as units."""
     listed = {key for _, keys in SETTINGS for key, _ in keys}
     keys = tuple(each for each in case.overridden if each[0] not in listed)
     some = [each for count in range(1, len(keys)) for each in combinations(keys, count)]
     is_each = len(keys) <= KEYS_MAX and all(map(partial(is_possible, case), some))
-    for each in [(key,) for key in keys] if is_each else [keys]:  # or they belong together
+    for each in [(key,) for key in keys] if is_each else [keys]:  # else all are one unit
         if keys and is_possible(case, keys):
             table = reading.to_table(case.scenario)
             names = (f"{key} = {dotted.value(table, key)}" for key, _ in each)
@@ -210,7 +210,7 @@ def is_possible(case: FlightCase, keys: Keys) -> bool:
 
 
 def _is_there(scenario: Scenario, keys: Keys) -> bool:
-    """Whether a scenario has another value of one of the keys."""
+    """Whether a scenario has another list, or a larger number, for one of the keys."""
     for key, value in keys:
         section, _, name = key.partition(".")
         own = getattr(getattr(scenario, section), name)

@@ -108,7 +108,7 @@ def _counted(parts: Iterable[CausePart]) -> list[str]:
 
 
 def _noun(unit: Unit) -> tuple[str, str]:
-    """Noun and direction, which is empty for what there is one of."""
+    """Noun of a unit, and its direction; empty for a unit without a direction, such as wind."""
     if not isinstance(unit, Bad):
         return named(unit), ""
     return WHAT[unit.is_late, unit.is_packet], f"of the {FLIGHT[unit.lane[1]]}"
@@ -121,7 +121,7 @@ def _kind(part: CausePart) -> object:
 
 
 def _row(parts: Sequence[CausePart], moment: Moment) -> list[str]:
-    """Cells of a row: where, when, what was lost, how much is enough, and the flight without it."""
+    """Cells of a row: lane, time, lost packets, length that is enough, result without the part."""
     first, last = parts[0], parts[-1]
     unit, plans = first.unit, sum(part.plans for part in parts)
     times = dict.fromkeys(f"{each:.1f}" for each in (first.start_s, first.end_s))
@@ -171,7 +171,7 @@ def _rescued(rescues: Rescues) -> str:
 
 
 def _off(error_m: float, sign: str = "") -> str:
-    """Error in brackets; empty if there is none, because no step was flown."""
+    """Error in brackets [m]; empty without an error (NaN), because no step was flown."""
     return "" if math.isnan(error_m) else f" ({error_m:{sign}.2f} m)"
 
 

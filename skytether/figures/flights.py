@@ -100,11 +100,11 @@ def draw_path(plane: "Axes", scenario: Scenario, flight: Record) -> None:
 def draw_packets(
     axes: "Axes", scenario: Scenario, direction: NDArray[np.uint8], arrived_s: Array
 ) -> None:
-    """Draw how many packets entered the network in each second, up and down.
+    """Draw the number of packets that entered the network in each second, uplink and downlink.
 
     Args:
         direction: UPLINK or DOWNLINK of each packet; shape (n,).
-        arrived_s: time at which each entered the network, 0 at the left end [s]; shape (n,).
+        arrived_s: time at which each packet entered the network [s], 0 at the left; shape (n,).
     """
     seconds = np.arange(int(arrived_s.max(initial=0.0)) + 2)
     axes.axhline(1.0 / scenario.control.dt, color="r", linestyle="--", zorder=0, label="every step")
@@ -158,7 +158,7 @@ def fleet(
         faint = 0.5 if separations else max(0.05, 1 / len(flights))
         plane.plot(x, y, "k-", linewidth=0.6, alpha=faint)
     if separations:
-        from skytether.shared.missions.derived import zones  # the package may be absent
+        from skytether.shared.missions.derived import zones  # missions may be absent
 
         for number, zone in enumerate(zones(scenario).zones):
             label = "" if number else "zones"

@@ -34,7 +34,7 @@ class Table:
 
     @property
     def groups(self) -> dict[str, list[int]]:
-        """Rows by their value in the first column if one repeats; otherwise one unnamed group."""
+        """Numbers of rows by value in the first column; without grouping, one unnamed group."""
         groups: dict[str, list[int]] = {}
         for at, (first, *_) in enumerate(self.rows):
             groups.setdefault(first if self.is_grouped else "", []).append(at)

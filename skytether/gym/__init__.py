@@ -10,7 +10,7 @@
 
 `skytether.policy.players` has the rules by which a robot chooses actions from chunks.
 Importing `flights` registers `skytether/Target-v0` with Gymnasium. The package imports `sim`,
-`netem`, `server` and `shared`; nothing imports it. It needs the extra `gym`.
+`netem`, `server` and `shared`; no package imports `gym`. It needs the extra `gym`.
 """
 
 from skytether.shared.base import extras

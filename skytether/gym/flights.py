@@ -40,8 +40,8 @@ from skytether.sim.world import World
 SINCE_MAX_S = 60.0
 OBSERVED = ("expected_gap", "error_x_m", "error_y_m", "since_sent_s", "heartbeat_due")
 """Elements of an observation: expected additional cost of flying on without a new packet, estimated
-distance from the target, time since the last packet to the vehicle, and whether a heartbeat is due.
-All are 0 before the first plan."""
+distance from the target in x and y, time since the last packet to the vehicle, and whether a
+heartbeat is due. All elements are 0 before the first plan."""
 _SPACE = Box(-1e9, 1e9, (len(OBSERVED),), np.float32)
 
 
@@ -50,8 +50,8 @@ class Decided(Trigger):
 
     Args:
         vehicle: number of the vehicle in each row; shape (capacity,).
-        thresholds: threshold of `expected_gap` by vehicle; infinite: never send, below 0: always
-            send.
+        thresholds: threshold of `expected_gap` by vehicle; if infinite, no plan is sent; if below
+            0, every plan.
     """
 
     doubts = True

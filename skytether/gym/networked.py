@@ -3,11 +3,11 @@
 Robot and environment are at one end, the agent at the other. Time is virtual: step k of the
 environment begins k · `step_s` after the episode's start, and nothing sleeps. At each step a robot
 receives the packets that have arrived, executes the step's action, and reports the next
-observation. A call of `step` is one answer of the agent: it is sent after the agent's thinking
-time, and the call simulates that time, at least one step.
+observation. A call of `step` passes one answer of the agent, which is sent after the agent's
+thinking time. The call simulates all steps of that time, at least one.
 
-With `thinking = "measured"` the thinking time is the real time between two calls. No other clock is
-read here.
+With `thinking = "measured"` the thinking time is the real time between two calls. The module reads
+no other clock.
 """
 
 import math
@@ -41,21 +41,21 @@ from skytether.shared.scenario.grammar import GrammarError
 if TYPE_CHECKING:
     _VectorWrapper = VectorWrapper[Any, Any, Any, Any, Any]
 else:
-    _VectorWrapper = VectorWrapper  # a generic type only since gymnasium 1.4
+    _VectorWrapper = VectorWrapper  # generic only since gymnasium 1.4
 
 MTU = 1472
-"""Largest UDP payload of a datagram that fits into 1500 B with headers [B]."""
+"""Largest UDP payload of a datagram that has at most 1500 B with its headers [B]."""
 KEY = "network"
 """Key of `info` with all entries about the network."""
 Answer = Any
-"""An action; actions for successive steps, the first for the step of the newest observation, as
-arrays with one more axis in front; a `Chunk` of actions; or None to send nothing."""
+"""One action; arrays of actions for successive steps along a first axis, beginning at the step of
+the newest observation; a `Chunk` of actions; or None, which sends nothing."""
 Exhausted = Literal["hold", "zero"] | Callable[[Any, Any], Any]
-"""Rule after the last received action: repeat it ("hold"), execute `idle` ("zero"), or call a
-function that returns an action from the robot's observation and last action (None before the
-first)."""
+"""Rule after the last received action: repeat that action ("hold"), execute `idle` ("zero"), or
+call a function that returns an action from the robot's observation and its last action (None before
+the first action)."""
 Compress = Callable[[Any], bytes | int]
-"""Function that returns an observation's compressed bytes, or their number."""
+"""Function that returns an observation's compressed bytes, or the number of these bytes."""
 
 
 class Options(TypedDict, total=False):
@@ -66,39 +66,39 @@ class Options(TypedDict, total=False):
     downlink: str
     """Impairments from robot to agent."""
     thinking: float | str
-    """Thinking time of an answer [s], its distribution such as "gamma(20ms, 80ms, 30ms)", or
-    "measured": the real time until `step` is called."""
+    """Thinking time of an answer: a number [s], a distribution such as "gamma(20ms, 80ms, 30ms)",
+    or "measured": the real time until `step` is called."""
     price: float
-    """Cost of each datagram with an answer, subtracted from the reward."""
+    """Cost of each datagram of an answer, subtracted from the reward."""
     seed: int
     """Seed of the network. `reset(seed=…)` restarts the network's random numbers from both seeds; a
-    `reset` without seed goes on to the next episode's random numbers."""
+    `reset` without a seed draws new random numbers for the next episode."""
     exhausted: Exhausted
-    """What the robot executes after the last received action: "hold" (that action), "zero"
-    (`idle`), or a function."""
+    """Rule for the robot after the last received action: "hold" repeats that action, "zero"
+    executes `idle`, a function chooses an action."""
     idle: Any
-    """Action that the robot executes before the first one arrives, and with `exhausted` "zero"; by
-    default zeros, or the nearest action in the action space."""
+    """Action that the robot executes before the first action arrives and, if `exhausted` is "zero",
+    after the last; by default zeros, or the action nearest to zeros."""
     player: Callable[[], Player]
     """Function that makes a `Player`, the robot's rule for choosing actions, for each episode."""
     step_s: float | None
     """Length of a step [s]; None: 1 / `render_fps` of the environment."""
     clock_ns: Callable[[], int]
-    """Function that returns the time, for `thinking` "measured" [ns]."""
+    """Function that returns the time [ns]; used if `thinking` is "measured"."""
     mtu: int
     """Largest UDP payload of a datagram [B], without 28 B of headers. A longer observation or
-    answer is sent in several datagrams, and has arrived when all of them have."""
+    answer is split into several datagrams, and arrives with the last of them."""
     compress: Compress | None
-    """Function that gives an observation's compressed bytes, or their number. The agent sees the
-    observation itself."""
+    """Function that returns an observation's compressed bytes, or the number of these bytes. Only
+    their number matters: the agent sees the observation itself."""
     shown_rows: int
-    """Number of rows in `coming` and `committed`."""
+    """Number of rows in `coming` and `committed` of `info["network"]`."""
 
 
 ORACLE: Options = {"uplink": "none", "downlink": "none", "thinking": 0.0, "price": 0.0}
-"""Options for an upper bound of a policy's return: no delay, no loss, no price."""
+"""Options that give an upper bound of a policy's return: no delay, no loss, no price."""
 NOTHING_SENT: Options = {"uplink": "loss(1)", "price": 0.0}
-"""Options for a lower bound of a policy's return: no answer arrives."""
+"""Options that give a lower bound of a policy's return: no answer arrives."""
 
 
 class _Far:
@@ -211,7 +211,7 @@ class _Far:
         return Chunk(rows, first, thought_ns)
 
     def thought_ns(self, *, is_nothing: bool) -> int:
-        """Thinking time of an answer [ns], measured or drawn; 0 if drawn and nothing is sent."""
+        """Measured or drawn thinking time of an answer [ns]; nothing is drawn for no answer: 0."""
         if self.thinking is None:
             return self._clock_ns() - self._returned_ns
         if is_nothing:
@@ -227,14 +227,14 @@ class _Far:
         ]
 
     def _row(self, played: Row) -> Row:
-        """Check the row that a player returned; raises ValueError if it is not one action."""
+        """Check the row that a player returned; raises ValueError if the row is not one action."""
         kind = np.shape(played), getattr(played, "dtype", None)
         if kind == (self._idle.shape, self._idle.dtype):
             return played
         return self._one(played, "row of the player")
 
     def _one(self, given: Any, name: str) -> Row:
-        """Row of one action; raises ValueError if it is not one action."""
+        """Row of one action; raises ValueError if `given` is not one action."""
         (row, *others) = to_rows(self.space, given, name)
         if others:
             raise ValueError(f"{name}: got {1 + len(others)} actions, expected one")
@@ -259,7 +259,7 @@ class _Far:
         self.begun().advance(self._present, [self._size(each) for each in self._present])
 
     def _size(self, observation: Any) -> int:
-        """Size of an observation as sent, compressed if so configured [B]."""
+        """Size of an observation when sent, compressed if `compress` is given [B]."""
         if self._compress is None:
             return size_of(observation)
         sent = self._compress(observation)
@@ -278,10 +278,10 @@ class Networked(gymnasium.Wrapper[Any, Any, Any, Any], RecordConstructorArgs):
         env = Networked(gymnasium.make("Pendulum-v1"), uplink="constant(50ms) & loss(10%)")
 
     `reset` returns the first observation without delay. Later the agent sees the newest observation
-    that has arrived. It answers with an action, with actions for successive steps from that
-    observation on, with a `Chunk`, or with None, which sends nothing. `info["network"]` lists what
-    arrived, what the robot holds, and what was sent, see docs/gym.md; the rest of `info` is the
-    environment's. The reward is the sum over the simulated steps, minus `price` for each datagram.
+    that has arrived. The agent answers with an action, with actions for successive steps from that
+    observation on, with a `Chunk`, or with None, which sends nothing. `info["network"]` describes
+    the packets and the robot's actions, see docs/gym.md; all other entries are the environment's.
+    The reward is the sum over the simulated steps, minus `price` for each datagram of the answer.
     The end of an episode is reported without delay.
 
     Args:
@@ -334,9 +334,9 @@ class NetworkedVector(_VectorWrapper):
     """`Networked` for a vector environment; its robots share both directions of the network.
 
     One agent answers all robots at once, with one thinking time for all answers. `step` takes a
-    list of one answer for each robot, or actions of the environment's own `action_space`. It
-    returns at the step at which an episode ends; the next call starts that robot's next episode, as
-    the environment does.
+    list with one answer for each robot, or actions of the environment's own `action_space`. `step`
+    returns early if a robot's episode ends; the next call starts that robot's next episode, as the
+    environment does.
 
     Args:
         env: vector environment that starts a new episode in the step after an end (gymnasium's
@@ -429,7 +429,7 @@ def _joined(info: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 def number(key: str, value: Any, low: float, high: float) -> float:
-    """Check a user's number; raises ConfigError if it is not between `low` and `high`."""
+    """Check a user's number; raises ConfigError if the number is not from `low` to `high`."""
     if not isinstance(value, Real) or not low <= float(value) <= high or value == math.inf:
         expected = f"a finite number from {low:g}" + (f" to {high:g}" if high < math.inf else "")
         raise ConfigError(f"{key}: got {value!r}, expected {expected}")
@@ -452,7 +452,7 @@ def _path(key: str, text: str) -> Impairments:
 
 
 def _thinking(given: float | str) -> Impairments:
-    """Delays of answers; raises ConfigError if the text loses answers or is not a delay."""
+    """Thinking times as delays; raises ConfigError for anything but delays, such as losses."""
     text = given if isinstance(given, str) else f"constant({float(given)!r})"
     delays = _path("thinking", text)
     if delays.queue or any(each.kind != "delay" for _, each in delays.parts) or delays.loss:

@@ -1,12 +1,12 @@
 """Robots and remote agents, connected by one network in virtual time.
 
 At each step a robot reports what it observes (downlink), and the agent may answer with a chunk of
-actions (uplink). Each of these messages is one datagram, or several if it is too long; it has
-arrived when all of them have. Netem decides their loss and delay. All robots share the two
-directions and their finite rates.
+actions (uplink). A long message is split into several datagrams, and arrives with the last of them.
+Netem decides the loss and delay of each datagram. All robots share the two directions and their
+finite rates.
 
-The network depends only on a datagram's size, so its bytes are zeros, and an attribute has the
-message. A datagram with a flipped bit is dropped, as by a checksum.
+Only the size of a datagram matters to the network, so its bytes are zeros, and an attribute holds
+the message. A datagram with a flipped bit is dropped, as by a checksum.
 """
 
 from collections import OrderedDict
@@ -32,16 +32,16 @@ from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 ROWS_MAX = 1024
 """Largest number of rows of a chunk."""
 UNDER_WAY_MAX = 4096
-"""Number of newest reports and answers that the agent remembers, each way."""
+"""Largest number of reports, and of answers, that the agent remembers; the oldest are forgotten."""
 DELAY_STEPS_MAX = 4096
 ANSWER_BYTES = 22
 """Size of an answer without its rows [B]: session, generation, step of the first row (8 B), number
-of rows (2 B), checksum; 4 B each unless stated."""
+of rows (2 B), checksum; 4 B for each field without a number."""
 REPORT_BYTES = 36
 """Size of a report without its observation [B]: session, step (8 B), the player's number of the
-step (8 B), newest generation held, the step at which it came (8 B), checksum."""
+step (8 B), newest generation held, the step at which that arrived (8 B), checksum."""
 PART_BYTES = 12
-"""Size of the header of each datagram of a split message [B]: message, number and count, as RTP."""
+"""Size of a datagram's header in a split message [B]: message, number, count; as large as RTP's."""
 
 
 class Network(NamedTuple):
@@ -55,13 +55,13 @@ class Network(NamedTuple):
 
 
 class ObservationReport(NamedTuple):
-    """Observation of a robot, as its agent receives it."""
+    """Report of a robot to its agent: an observation, and the newest chunk that the robot holds."""
 
     step: int
     number: int
-    """Number of the step by the robot's player; default of `Chunk.first` of an answer."""
+    """Number of the step by the robot's player: the default of `Chunk.first` of an answer."""
     acknowledged: int
-    """Newest generation of chunks that the robot held; 0 for none."""
+    """Generation (number) of the newest chunk that the robot held; 0 without a chunk."""
     since: int
     """Step at which the generation `acknowledged` arrived."""
     observation: Any
@@ -72,7 +72,7 @@ class Message:
     session: int
     content: Held | ObservationReport
     missing: set[int]
-    """Numbers of the datagrams that have not arrived."""
+    """Numbers of the message's datagrams that have not arrived yet."""
 
 
 class Part(bytes):
@@ -90,9 +90,9 @@ class Robot:
     uplink: Lane
     downlink: Lane
     sent: OrderedDict[int, tuple[int, Held]]
-    """Answers under way, by generation, each with the step of its observation."""
+    """Answers under way by generation: step of the observation that was answered, and the rows."""
     snapshots: OrderedDict[int, Player]
-    """Snapshots of the robot's player, by the steps of reports under way."""
+    """Snapshots of the robot's player at the steps of reports that are under way, by step."""
     session: int = 0
     generation: int = 0
     acknowledged: int = 0
@@ -115,8 +115,8 @@ class Remote:
         step_ns: length of a step of the environment [ns].
         none: empty array of rows of actions; shape (0, *row).
         shown: number of rows in `coming` and `committed`.
-        fill: returns the row that a robot executes after rows have run out, from its last (None
-            before the first); None if the agent cannot know it.
+        fill: returns the row that a robot without rows executes, from the robot's last row (None
+            before the first); returns None if the agent cannot know that row.
     """
 
     def __init__(
@@ -135,8 +135,8 @@ class Remote:
         self.downlink = Link(DOWNLINK, QUEUE_BYTES_MAX, None, network.downlink)
         self._bound = delay_bound(count, step_ns / SECOND_NS, DELAY_STEPS_MAX, None)
         self._leaving: list[tuple[int, int, Message, int]] = []
-        """Answers whose thinking time has not ended: time of sending [ns], robot, message, size. At
-        most one per robot in a call of `step`, which normally lasts until they are sent."""
+        """Answers whose thinking time has not ended: time of sending [ns], robot, message, size
+        [B]. A call of `step` adds at most one per robot, and normally lasts until all are sent."""
         self._robots: list[Robot] = []
         self.step = 0
         self._flows = 0
@@ -166,7 +166,7 @@ class Remote:
         return Lane(flow, Fates(getattr(network, way), network.seed, way, flow), self.now_ns)
 
     def answer(self, index: int, chunk: Chunk, at_ns: int) -> int:
-        """Send rows to a robot at a time, now or later [ns]; returns the number of datagrams."""
+        """Send rows to a robot at the time `at_ns` [ns]; returns the number of datagrams."""
         robot, rows = self._robots[index], chunk.rows
         robot.generation += 1
         first = robot.report.number if chunk.first is None else chunk.first
@@ -178,7 +178,7 @@ class Remote:
         return count
 
     def _datagrams(self, size: int) -> int:
-        """Number of datagrams for a message of a size [B]."""
+        """Number of datagrams into which a message of a given size [B] is split."""
         mtu = self._network.mtu
         return 1 if size <= mtu else -(-size // (mtu - PART_BYTES))
 
@@ -191,11 +191,11 @@ class Remote:
         return played
 
     def last(self, index: int) -> Row | None:
-        """Row of actions that a robot repeats when it has none left."""
+        """Last row that a robot executed; the robot may repeat that row when no row is left."""
         return self._robots[index].player.last
 
     def advance(self, observations: Sequence[Any], sizes: Sequence[int]) -> None:
-        """Advance to the next step, with each robot's observation there and its size [B]."""
+        """Advance to the next step; each robot reports its observation, of the given size [B]."""
         self.step += 1
         self._hear_agents()
         for index, (robot, observation, size) in enumerate(
@@ -266,7 +266,7 @@ class Remote:
         """Entries of `info` for the agent of a robot, as docs/gym.md lists them."""
         robot, report = self._robots[index], self._robots[index].report
         age_steps = self.step - report.step
-        # Before the first acknowledgement, both directions count as equally slow.
+        # Before the first acknowledgement, both directions are assumed to be equally slow.
         delay_steps = int(self._bound.steps[index]) or 2 * age_steps
         held, every, settled, until = self._coming(robot, delay_steps)
         up, down = self.uplink.counts, self.downlink.counts
@@ -296,12 +296,12 @@ class Remote:
         return padded
 
     def _coming(self, robot: Robot, delay_steps: int) -> tuple[int, NDArray[Any], int, int]:
-        """Predict from the agent's knowledge the rows that a robot executes from the observation's
-        step on, at most `shown`: from the newest report, and the answers under way, each expected
-        to arrive `delay_steps` after its observation.
+        """Predict, as the agent can, at most `shown` rows that a robot executes from the newest
+        report's step on. An answer under way is expected to arrive `delay_steps` after the
+        observation that it answers.
 
-        Returns: number of rows that the robot held at that step, the predicted rows, number of them
-        within `delay_steps`, and number before rows run out.
+        Returns: number of rows that the robot held at that step, the predicted rows, number of
+        predicted rows within `delay_steps`, and number of rows before the robot runs out of rows.
         """
         step, rows = robot.report.step, list[Row]()
         if step not in robot.snapshots:

@@ -30,7 +30,7 @@ def _parts(space: Space) -> Mapping[str, Space]:
 
 
 def no_rows(space: Space, name: str = "action space") -> NDArray[Any]:
-    """Empty array for rows of a space's actions; shape (0, *row).
+    """Empty array of the dtype and row shape of a space's actions; shape (0, *row).
 
     Raises:
         ConfigError: actions of the space cannot be rows.

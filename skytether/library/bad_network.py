@@ -22,7 +22,7 @@ from skytether.shell.commandline import plugins
 from skytether.shell.driving.driver import Shell, new_event_loop
 
 LOG = logging.getLogger("skytether.netem")
-"""Logger of what `skytether netem` prints, for example that a server is unreachable."""
+"""Logger of the messages that `skytether netem` prints, such as that a server is unreachable."""
 T = TypeVar("T")
 
 

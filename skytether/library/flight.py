@@ -134,7 +134,7 @@ class Flight:
 
     @extras.named()
     def explain(self, at: float | None = None, *, seeds: int = 0) -> "Explanation":
-        """Explain why the vehicle braked or was far off: moments, cause, rescues and remedies.
+        """Explain why the vehicle braked or was far off, and what would have prevented it.
 
         The flight, which must be in virtual time, is flown again up to a hundred times, see
         docs/explain.md. A progress bar is shown if stderr is a terminal.
@@ -263,7 +263,7 @@ class Flight:
 
 @extras.named()
 def table(flights: Iterable[Flight]) -> "pandas.DataFrame":
-    """Table of flights: one row each, one column for each single-valued field of `Summary`.
+    """Table of flights: a row for each flight, a column for each single-valued field of `Summary`.
 
     Raises:
         ExtraMissing: pandas is not installed.

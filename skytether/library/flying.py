@@ -80,9 +80,9 @@ def fly(
         secure: whether the link is encrypted, with keys made for this flight.
         server: endpoint in place of Skytether's server, only in virtual time; each flight needs a
             new one.
-        planner: class that plans in place of the MPC, see `skytether.plugin.Planner`, only in
-            virtual time; the same as `control.planner` with the name of a class that `@planner`
-            decorates.
+        planner: class that plans in place of the MPC, see `skytether.plugin.Planner`; only in
+            virtual time. A class decorated by `@planner` can also be given by its name, as
+            `control.planner`.
         keys: see `load`.
 
     Returns:
@@ -156,8 +156,8 @@ def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
 
 
 def prepare(*scenarios: Scenario) -> None:
-    """Compile the kernels that these scenarios call, or without scenarios those of all schemes,
-    with a note on stderr. Kernels that are on disk already are not compiled again.
+    """Compile the kernels that these scenarios call, or without scenarios the kernels of all
+    schemes, unless they are on disk already; prints a note on stderr.
     """
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.server.schemes import loading

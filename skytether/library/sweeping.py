@@ -47,7 +47,7 @@ class Swept:
 
     @extras.named()
     def to_pandas(self) -> "pandas.DataFrame":
-        """Table of the flights: one row each, with the keys of the grid in its first columns.
+        """Table with a row for each flight, and the keys of the grid in the first columns.
 
         The other columns are those of `skytether.table`.
 
@@ -119,7 +119,7 @@ def _items(grid: Mapping[str, Iterable[Any]]) -> Iterable[tuple[str, Iterable[An
 
 
 def _axis(key: str, values: Iterable[Any]) -> lab.GridAxis:
-    """One key of the grid.
+    """Axis of a sweep: a key of the grid and its values.
 
     Raises:
         ConfigError: the key cannot be swept, or has no values, or a value twice.

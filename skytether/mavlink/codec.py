@@ -4,8 +4,8 @@ A frame begins with 0xFD (MAVLink 2) or 0xFE (MAVLink 1), and has its length and
 that fit no frame are skipped one at a time, so a truncated frame does not lose the frames after it.
 
 The checksum includes a byte that depends on the type of the message. PX4 sends several frames a
-second of types that the dialect lacks. A frame counts as one of these if some value of this byte
-fits, which is true of one damaged frame in 256.
+second of types that the dialect lacks. A frame counts as such a frame if its checksum fits with any
+value of this byte; that is also true of one damaged frame in 256.
 """
 
 from typing import Any
@@ -76,7 +76,7 @@ class Codec:
 
 
 def _length(data: bytearray, at: int) -> int:
-    """Length of the frame that begins at index `at` [B]; 0 if none does.
+    """Length of the frame that begins at index `at` [B]; 0 if no frame begins there.
 
     A truncated header counts as the longest frame.
     """

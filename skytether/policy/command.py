@@ -112,16 +112,16 @@ class JoinOptions(EndOptions):
     begin: str = "60s"
     """Longest time from the first call to its answer; some policies compile at first."""
     step: str | None = None
-    """Length of a control step, in which the program executes a row, as in 20ms; by default it is
-    measured as the time from an answer to the next call, divided by --rows."""
+    """Length of a control step, in which the program executes a row, as in 20ms; by default the
+    measured time from an answer to the next call, divided by --rows."""
     rows: Annotated[int, Argument(metavar="N")] = 1
     """Number of rows that the program executes of each answer: `action_horizon` of openpi's
     ActionChunkBroker, or 1 without one."""
     plays_on: bool = False
     """Whether the robot continues to execute rows during a call. Requires --step."""
     when: str = "always"
-    """Observations that are sent: always, each; needed(N), those for which fewer than N rows will
-    remain when their action chunk arrives."""
+    """Observations that are sent: always sends each; needed(N) sends an observation only if fewer
+    than N rows will remain when its action chunk arrives."""
     merge: Literal["clock", "average", "drtc"] = "clock"
     """Rule for a step with rows in several chunks: clock, the row of the newest chunk; average,
     LeRobot's weighted average; drtc, DRTC's rule. The last two count steps by executed rows, the
@@ -192,8 +192,8 @@ def join(argv: Sequence[str]) -> None:
 
     The program connects to --listen with openpi's client. If the action chunk of a call has not
     arrived by the deadline, the answer has the remaining rows of earlier chunks. If no row remains,
-    it is the hold action, for at most --hold; then an error, on which the program must stop the
-    robot.
+    the answer is the hold action for at most --hold, and then an error, on which the program must
+    stop the robot.
     """
     options = read(JoinOptions(), argv, "skytether policy join", join.__doc__)
     if options.actions == "":

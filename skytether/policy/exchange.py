@@ -1,7 +1,7 @@
 """Exchange of messages between the two ends of a session, each as datagrams with parity.
 
-Once its first part is sent, a message is sent completely, however slow the path is. Of the messages
-of a stream that wait for it, only the newest is kept. Each end reports the received parts of each
+Once its first part is sent, a message is sent completely, however slow the path is. Of a stream's
+messages that wait meanwhile, only the newest is kept. Each end reports the received parts of each
 message, from which the sender estimates send rate, packet loss ratio and round-trip time.
 """
 
@@ -75,7 +75,7 @@ class Exchange:
         self.sent = self.sent_bytes = self.dropped = self.came = self.repaired = 0
 
     def send(self, stream: int, message: bytes, *, is_urgent: bool = False) -> None:
-        """Send a message; replaces a message of the stream that waits.
+        """Send a message, which replaces a message of the same stream that still waits.
 
         Args:
             is_urgent: whether at least as many parity parts as data parts are sent, so that any

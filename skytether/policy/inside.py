@@ -141,8 +141,8 @@ def serve(
     """Serve a function as the policy of robots, until Ctrl-C.
 
     Args:
-        infer: from an observation to a dict with the array `actions`, shape (n, *row), or to that
-            array. It is called in one thread.
+        infer: function from an observation to the array of actions, shape (n, *row), or to a dict
+            with the array as `actions`; called in one thread only.
         bind: HOST:PORT to listen on for robots.
         keys: file of `skytether keygen` with the keys of all robots; None: plaintext.
         insecure: whether plaintext links to other machines are allowed.

@@ -31,7 +31,7 @@ class CalibrateOptions:
     scenario: ScenarioName = "paper"
     """Scenario that the search starts from: a name (`skytether list scenarios`) or a .toml file."""
     objective: Literal["table1", "rmse"] = "table1"
-    """Goal of the search: table1, to reproduce the paper's Table 1, or rmse, the smallest mean RMSE
+    """Goal of the search: table1 reproduces the paper's Table 1; rmse minimises the mean RMSE
     xy."""
     packets: float = 0.1
     """Largest event ratio, for the objective rmse with a trigger that uses the state."""
@@ -40,8 +40,8 @@ class CalibrateOptions:
     by default no limit."""
     free: Annotated[tuple[str, ...], Argument(metavar="KEY=LOW:HIGH")] = ()
     """Keys that may change, each within its bounds, on a logarithmic scale. By default table1
-    changes weights and plant; rmse changes the keys of scheme and trigger, and the weights except
-    the position's, as only ratios matter."""
+    changes weights and plant; rmse changes the keys of scheme and trigger, and all weights except
+    that of the position, because only ratios of weights matter."""
     runs: int = 10
     """Number of flights of each point (with table1: for each column of the table); seeds count up
     from --seed."""
@@ -53,7 +53,7 @@ class CalibrateOptions:
     """Initial step size, as a share of each key's range."""
     pool: PoolFlags = Flags()
     out: Path = Path("calibration")
-    """Folder for every point flown (journal.jsonl) and for the best one (best.toml)."""
+    """Folder for every point flown (journal.jsonl) and the scenario of the best (best.toml)."""
     config: ScenarioFlags = Scenario()
 
 
@@ -101,7 +101,7 @@ def calibrate(argv: Sequence[str]) -> None:
             for flown in flyers.search(search, options.out, options.generations):
                 points = flown
         if not points:
-            raise CommandError("ended before the first generation was flown")
+            raise CommandError("the search ended before its first generation was flown")
         files.write(options.out / BEST, to_toml(search.scenario(best(points))))
     if is_rmse:
         _print_rmse(points)

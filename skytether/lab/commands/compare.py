@@ -57,9 +57,9 @@ class CompareOptions:
 def compare(argv: Sequence[str]) -> None:
     """Compare schemes and triggers on a target whose motion only the server sees.
 
-    OUT/report.html has the tables and figures, and opens offline; each is in OUT as CSV, PNG and
-    PDF as well. All flights are stored: after Ctrl-C or a crash, the same command continues; after
-    the last flight, it only draws the report again.
+    OUT/report.html has the tables and figures, and opens offline. OUT also has every table as CSV,
+    and every figure as PNG, PDF and CSV. All flights are stored: after Ctrl-C or a crash, the same
+    command continues; after the last flight, it only draws the report again.
     """
     options = read(CompareOptions(), argv, "skytether compare", compare.__doc__)
     command.check_count("--runs", options.runs, 100_000)
@@ -110,7 +110,7 @@ def run(
 
 
 def _scout(options: CompareOptions, plans: Sequence[Plan], number: int) -> int:
-    """Fly the scouting flights of a round: all points in round 0, later ones near a budget.
+    """Fly the scouting flights of a round: in round 0 all points, later only points near a budget.
 
     Returns the number of flights flown by this call.
     """

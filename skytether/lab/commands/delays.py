@@ -26,7 +26,7 @@ LAST_S = 1.0
 
 
 class _End(asyncio.DatagramProtocol):
-    """End of the path; records the delays of received packets by number and timestamp."""
+    """Receiving end of the path; records each packet's delay by its number and timestamp."""
 
     def __init__(self, answers: bool) -> None:
         self._answers = answers

@@ -61,19 +61,19 @@ class IdentifyOptions:
     """Scenario to be flown later: a name (`skytether list scenarios`) or a .toml file. The
     written scenario extends it."""
     speed: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
-    """Size of step [m/s], one for all axes or one for each. By default the largest speed of the
-    desired trajectory on the axis, but at least half of its largest speed on any axis."""
+    """Height of the velocity steps [m/s], one number for all axes or one for each axis. By default
+    the reference's largest speed on the axis, but at least half of its largest speed on any."""
     also: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
-    """Further sizes of step to fly [m/s], to measure the error of a model identified at another
-    size."""
+    """Further heights of velocity steps to fly [m/s], to measure the errors of models that are
+    identified at other heights."""
     hold: float | None = None
-    """Time after each step [s]; by default four time constants of the scenario's model, within 3 to
-    6 s."""
+    """Time for which each velocity step is held [s]; by default four time constants of the
+    scenario's model plus its dead time, within 3 to 6 s."""
     repeats: int = 3
     """Number of repetitions on each axis, of four steps each: out, back, to the other side,
     back."""
     set_parameters: bool = False
-    """Make the parameters of the autopilot safe for the case that set-points stop. Without
+    """Set parameters of the autopilot so that the vehicle is safe if set-points stop. Without
     --set-parameters, unsafe values are only reported, and the vehicle is not armed."""
     out: Path = Path("identified")
     """Folder for the scenario (scenario.toml), the picture (steps.png), the measurements
@@ -304,7 +304,7 @@ def _show_models(flown: SizeFlown) -> None:
 
 
 def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
-    """Table of the largest errors at the requested size of step, of models from each size."""
+    """Largest errors at the requested height of steps, of the models identified at each height."""
     measured = [axis.responses for axis in flown[0].axes]
 
     def off(model: Fit | None, axis: int) -> float:

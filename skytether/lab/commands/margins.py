@@ -37,7 +37,7 @@ def margins(argv: Sequence[str]) -> None:
 
     The vehicle hovers in virtual time, over the scenario's network. After a weak push:
 
-      growth   of the mean square of the deviation per step; below 1 it is stable
+      growth   of the mean square of the deviation per step; below 1 the loop is stable
 
     In the scenario's white wind and noise, if the loop is stable:
 
@@ -46,8 +46,8 @@ def margins(argv: Sequence[str]) -> None:
 
     The server plans with the scenario's model. The first row has the scenario's own vehicle; in the
     other rows the vehicle differs as described. The second table has limits, found by bisection:
-    how far one quantity may differ, relative to the model, before the loop is no longer stable. A
-    trigger that uses the state is replaced by a periodic one with the same mean rate for pushes,
+    how far one quantity may differ from the model's before the loop is no longer stable. For
+    pushes, a trigger that uses the state is replaced by a periodic trigger with the same mean rate,
     because a weak push stays below every threshold.
     """
     options = command.parse(MarginsOptions(), argv, "skytether margins", margins.__doc__)

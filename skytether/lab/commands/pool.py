@@ -43,7 +43,7 @@ from skytether.shell.host import system
 from skytether.shell.processes.pool import processes
 
 UNDER_WAY_MAX = 256
-"""Largest number of submitted tasks; larger than the number of cores of any machine."""
+"""Largest number of tasks submitted at a time; larger than the number of cores of any machine."""
 POLL_S = 0.2
 CONNECT_S = 10.0
 
@@ -157,7 +157,7 @@ class Crew:
         return list(self.study(fly, dict(enumerate(items)), size=lambda _: 0.0).values())
 
     def sweep(self, plan: Sweep, out: Path, text: str = "") -> Results:
-        """Results of all tasks of a sweep; stored and raised as in `study`."""
+        """Results of all tasks of a sweep; storage and errors are those of `study`."""
         tasks, before = {(task.cell, task.chunk): task for task in plan.tasks()}, len(self.fresh)
         results = self.study(
             skytether.lab.engine.sweep.fly,
@@ -174,7 +174,7 @@ class Crew:
     def search(
         self, search: Search, out: Path, generations: int, text: str = ""
     ) -> Iterator[list[SearchPoint]]:
-        """All points of a search so far, after each generation; stored and raised as in `study`."""
+        """All points of a search so far, after each generation; storage, errors as in `study`."""
 
         def fly_all(cells: Mapping[Point, Scenario]) -> Mapping[Point, Values]:
             kind, settings = dict[str, dict[str, float | None]], search.settings()
@@ -247,7 +247,7 @@ def study(
     """Fly a study that is a whole command; returns the results in order, see `Crew.study`.
 
     Args:
-        cells: items to fly, which are also their keys in the journal; later calls may have more.
+        cells: items to fly, which are also the keys in the journal; a later call may add items.
 
     Raises:
         CommandError: interrupted, a worker has died, or the folder cannot be written.

@@ -49,9 +49,9 @@ def sweep(argv: Sequence[str]) -> None:
     """Fly a scenario many times in virtual time, for every combination of some keys' values.
 
     OUT/runs.csv has a row for each flight, OUT/cells.csv one for each combination, with means and
-    95 % intervals; for one or two keys it also has pictures. All flights are stored: after Ctrl-C
-    or a crash, the same command continues. The resulting tables are identical for any number of
-    workers.
+    95 % intervals. With one or two keys, OUT also has pictures. All flights are stored: after
+    Ctrl-C or a crash, the same command continues. The resulting tables are identical for any number
+    of workers.
     """
     options = command.parse(
         SweepOptions(tyro.MISSING), argv, "skytether sweep", sweep.__doc__, is_final=False

@@ -31,11 +31,11 @@ from skytether.shared.scenario.whole import Scenario
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 """Budgets: largest numbers of packets per second, both directions together, with heartbeats."""
 SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
-"""Budgets for which points are chosen: BUDGETS, and 4.5 per second for the claimed ratios
-(`comparison.CLAIMS`): slightly less than 0.12 of the packets of the paper's scheme at every step.
+"""Budgets for which points are chosen [packets/s]: BUDGETS, and 4.5 for `comparison.CLAIMS`, which
+is slightly less than 12 % of the packets of the paper's scheme when that sends at every step.
 """
 CLOSE = 1.05
-"""Smallest ratio of neighbouring thresholds at which a threshold between them is tried."""
+"""A threshold between two neighbouring thresholds is tried if their ratio is at least this."""
 EFFORT_RATIO_MAX = 1.05
 """Largest ratio of a chosen point's effort to the effort limit of its case."""
 REPORTS: Mapping[str, Mapping[str, Any]] = {
@@ -175,7 +175,7 @@ class Plan:
         return self._sweep(self._scenario, list(each.values()), self.runs)
 
     def scouted(self, points: Sequence[FlownContender], sweep: Sweep, done: Results) -> None:
-        """Store the results of scouting flights: of the sweep by `scouts` for the same points."""
+        """Store the results of the scouting flights of `points`, flown by the sweep of `scouts`."""
         for cell, point in enumerate(points):
             runs = sweep.of_cell(done, cell)
             packets, effort = (

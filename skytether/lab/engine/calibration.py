@@ -130,7 +130,7 @@ TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
 OBSERVER_KEYS = (Free("control.observer_s", 0.05, 50.0),)
 MEANS = ("rmse_xy", "event_ratio", "effort_mps", "saturated")
 ONLY = "here"
-"""Name of the column for an objective that has no columns."""
+"""Name of the only column of an objective without named columns."""
 
 
 def trigger_keys(trigger: str) -> Sequence[Free]:

@@ -108,7 +108,7 @@ class ComparedCase:
         return [found[name] for name in dict.fromkeys([*first, *found])]
 
     def curve(self, contender: str) -> list[ContenderRuns]:
-        """Runs of a contender's chosen points by rising budget; a point of several budgets once."""
+        """Runs of a contender's chosen points by rising budget; each point occurs only once."""
         points = (self.bought.get((contender, budget)) for budget in SOUGHT)
         return list({id(each): each for each in points if each is not None}.values())
 
@@ -135,8 +135,8 @@ def compared(
 
 
 def ratio(ours: ContenderRuns, theirs: ContenderRuns) -> tuple[float, float, float] | None:
-    """Ratio of the mean RMSE xy of our contender to that of the other, and its 95 % interval, see
-    `jackknife`; computed for the logarithm, because a ratio is positive.
+    """Ratio of our contender's mean RMSE xy to the other contender's, and the ends of its 95 %
+    interval (`jackknife` of the ratio's logarithm, because a ratio is positive).
 
     None if fewer than two seeds succeeded with both contenders.
     """
@@ -168,7 +168,7 @@ class Judged:
 
     @property
     def medians(self) -> float | None:
-        """Ratio of the two median RMSE xy; None if one has no runs."""
+        """Ratio of the two median RMSE xy; None if either contender has no runs."""
         ours, theirs = self.ours.median(), self.theirs.median()
         return ours / theirs if ours and theirs else None
 
@@ -179,7 +179,7 @@ class Judged:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the whole interval is below the claimed ratio; None without a claimed ratio."""
+        """Whether the whole interval is within the claim, and the packets too; None if no claim."""
         if self.at_most is None:
             return None
         return self.sparse and self.ratio is not None and self.ratio[2] <= self.at_most
@@ -198,14 +198,14 @@ def judge(claim: Claim, compared: ComparedCase) -> Judged | None:
 
 
 def ranked(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
-    """Runs within a budget by mean RMSE xy; failed ones come last."""
+    """Runs within a budget in the order of their mean RMSE xy; failed runs come last."""
     flown = [runs for (_, within), runs in compared.bought.items() if within == budget]
     return sorted(flown, key=lambda each: (math.isnan(each.mean(RMSE)), each.mean(RMSE)))
 
 
 def leading(compared: ComparedCase, budget: float) -> list[ContenderRuns]:
-    """Runs within a budget with the least mean RMSE xy, and those without a significant difference
-    from it.
+    """Runs within a budget with the least mean RMSE xy, and the runs that do not differ from them
+    significantly.
     """
     best_first = ranked(compared, budget)
     return [

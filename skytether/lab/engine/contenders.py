@@ -31,7 +31,7 @@ ROUNDS = 4
 """Number of rounds in which thresholds are bisected near each budget.
 
 In the case `target`, at 1 packet/s, 5 % more packets reduce the error by a fifth. With coarse
-thresholds, contenders would leave much of a budget unused and seem too bad.
+thresholds, contenders would leave part of a budget unused, and their errors would be too large.
 """
 NEAR = (0.1, 0.3, 1, 3, 10, 30, 100)
 """Factors by which thresholds are multiplied for scouting flights."""
@@ -89,8 +89,8 @@ COMMITTED = {
     "observer_s": 4.0,
     "horizon": 60,
 } | TIGHT
-"""Scheme with committed inputs. The search varies the time constant of its observer; if long, the
-observer has no effect.
+"""Scheme with committed inputs. The search varies the time constant of the scheme's observer; a
+long time constant has the same effect as no observer.
 """
 FEEDBACK = COMMITTED | {"feedback": True}
 TRAJECTORY = {
@@ -111,8 +111,8 @@ COST_GAP = {"trigger": "cost_gap(300.0)"}
 EXPECTED_GAP = {"trigger": "expected_gap(300.0)"}
 SILENT = {"trigger": "cost_gap(3.0) | silence(1)"}
 ACKNOWLEDGED = {"trigger": "expected_gap(3.0) | heartbeat"}
-"""Trigger for trajectories. Its threshold is smaller, because it is the cost of one step, not of a
-horizon.
+"""Trigger for trajectories. Its threshold is smaller than for horizons, because the cost is that of
+one step, not of all steps of a horizon.
 """
 
 
@@ -185,8 +185,8 @@ TARGET = {
 inputs relative to the target's velocity (`control.input_reference`).
 """
 CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap", "trajectory-expected")
-"""Contenders on the circle, where the reference is known in advance: a vehicle could follow it
-without a network.
+"""Contenders on the circle, where the reference is known in advance: a vehicle could follow the
+circle without a network.
 """
 
 
@@ -202,13 +202,13 @@ def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -
 
 
 def _network(argument: str, value: Any) -> Mapping[str, Any]:
-    """Keys that set an argument of both directions of the network, or their whole text with ""."""
+    """Keys that set an argument of both directions' impairments; with "", all their impairments."""
     at = f".{argument}" if argument else ""
     return {f"network.{way}{at}": value for way in ("uplink", "downlink")}
 
 
 def _noise(position_m: float) -> Mapping[str, Any]:
-    """Keys of the sensor's noise; the velocity's, in m/s, is 2.5 times the position's."""
+    """Keys of the sensor's noise; the velocity's noise is 2.5/s times the position's [m]."""
     return {
         "sensor.position_noise_m": position_m,
         "sensor.velocity_noise_mps": 2.5 * position_m,

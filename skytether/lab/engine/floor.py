@@ -146,7 +146,7 @@ def summarise_aboard(scenario: Scenario) -> Summary:
 # -- baselines of a case ---------------------------------------------------------------------------
 
 PERIODS = (1, 3, 10, 30)
-"""Steps between two packets at which the floor is computed."""
+"""Numbers of steps between two packets for which the floor is computed."""
 RUNS = 4
 
 
@@ -163,7 +163,7 @@ class Baselines:
 
     floor: Sequence[Floor] = ()
     """Lower bound of the RMSE at several packet rates: for all contenders if only the server sees
-    the target; in wind, for those without feedback aboard.
+    the target; in wind, only for contenders without feedback aboard.
     """
     aboard: Sequence[Summary] = ()
     """Flights with the reference aboard and no packets; none if only the server knows the

@@ -3,15 +3,15 @@ from the model.
 
 The loop is flown in virtual time: vehicle, server and network of a scenario, hovering. There are
 two kinds of flights.
-    push   only a weak wind for PUSH_S; h(n): mean over seeds and axes of p² n steps after it
+    push   only a weak wind for PUSH_S; h(n): mean of p² over seeds and axes, n steps after the wind
            growth = lim h(n+1) / h(n), of the mean square; below 1 the loop is stable
     wind   only the scenario's white wind and noise: root mean square of p and u
 
-The growth is that of the linear loop, so nonlinear effects are removed. Bounds: only steps before
-an input reaches SMALL of its bound are used. Noise: the flight is repeated without the push, and p
-is the difference. Thresholds: a weak push stays below all of them, so a trigger that uses the state
-would never send; it is replaced by a periodic one with its measured rate. Wind is flown with the
-scenario's own trigger.
+The growth is that of the linear loop in the position's deviation p. Bounds: only steps before an
+input u reaches SMALL of its bound are used. Noise: the flight is repeated without the push, and p
+is the difference of the flights. Thresholds: a weak push stays below them, and a trigger that uses
+the state would never send, so a periodic trigger with its measured rate replaces it. Flights in
+wind use the scenario's own trigger.
 """
 
 import math
@@ -48,13 +48,13 @@ above the rounding errors of messages with a noise of some centimetres.
 FLOOR = 1e-9
 """Share of the largest mean square below which a mean square counts as rounding error."""
 SETTLE_S, ROUND_TRIPS = 5.0, 4.0
-"""Time before a push: seconds, plus a number of mean round trips. By then sessions are open and the
-delay bound is stationary.
+"""Time before a push: a time [s], plus a number of mean round trips. When the push begins, sessions
+are open, and the delay bound is stationary.
 """
 WIND_S, WIND_BUILDS_S = 60.0, 10.0
 """Time for which the response to wind is evaluated, and the time before for its build-up [s]."""
 SMALL = 0.05
-"""Share of an input's bound up to which a response is evaluated, so that no bound acts."""
+"""A response is evaluated until an input reaches this share of its bound: so no bound is active."""
 STEPS_MIN = 10
 """Smallest number of steps from which a growth can be estimated."""
 WIND_ALONE = 0.1
@@ -151,7 +151,7 @@ class Margin(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MarginLimit(msgspec.Struct, frozen=True, kw_only=True):
-    """Largest value of a quantity for which the loop is stable, other quantities unchanged."""
+    """Largest value of a quantity for which the loop is stable; other quantities keep theirs."""
 
     quantity: str
     """Name of the quantity in a table."""

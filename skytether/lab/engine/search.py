@@ -72,7 +72,7 @@ def check_free(free: Sequence[Free], start: Scenario) -> None:
         if not key.low <= value <= key.high:
             raise ConfigError(
                 f"--free: {key.key}: got the bounds {key.low:g} to {key.high:g}, "
-                f"expected them to hold {value:g}, where the search starts"
+                f"expected bounds around {value:g}, where the search starts"
             )
 
 
@@ -121,7 +121,7 @@ class Optimiser:
         self._points: list[Any] = []
 
     def ask(self) -> list[Scenario]:
-        """Scenarios of the next generation; the first one of all is the start of the search."""
+        """Scenarios of the next generation; the first generation begins with the search's start."""
         first = self._search.countiter == 0
         self._points = self._search.ask()
         if first:

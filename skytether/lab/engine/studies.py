@@ -261,7 +261,7 @@ Cells = Mapping[tuple[float, str], MethodFlights]
 
 
 def cells(study: Study, first: Sweep, firstly: Results, second: Sweep, secondly: Results) -> Cells:
-    """Cells of a study, from the results of both of its sweeps."""
+    """Cells of a study, from the results of its two sweeps."""
     found = {key: MethodFlights(runs) for key, runs in flown(first, firstly).items()}
     periods = [
         int(TRIGGERS.one(keys["control.trigger"]).values[0]) for _, keys in second.axes[0].points()

@@ -31,7 +31,7 @@ BEGINNINGS = 2
 BIN_S = 0.05
 """Time over which the residuals of steps are averaged [s]."""
 GOOD = 0.1
-"""Largest acceptable difference between measured and predicted step, as a share of its height."""
+"""Largest accepted difference between measured and predicted step, as a share of the height."""
 SURE = 4.0
 """Number of standard errors above `GOOD` at which a model is rejected."""
 
@@ -53,7 +53,7 @@ class StepResponse(NamedTuple):
 
     @property
     def starts(self) -> bool:
-        """Whether the step starts a motion; otherwise it ends one."""
+        """Whether the step starts a motion; otherwise the step ends a motion."""
         return abs(self.after) > abs(self.before)
 
 
@@ -215,7 +215,7 @@ def differences(response: StepResponse, numbers: Numbers) -> Array:
 
 
 def misfit(responses: Sequence[StepResponse], numbers: Numbers) -> Misfit:
-    """Residual of a model for responses, also for others than those to which it was fitted."""
+    """Residual of a model for responses; the model may have been fitted to other responses."""
     shares = [differences(each, numbers) for each in responses]
     rms = float(np.sqrt(np.mean(np.concatenate(shares) ** 2)))
     worst = Misfit(rms, 0.0, 0.0, 0.0)

@@ -18,9 +18,9 @@ from skytether.shared.scenario.whole import Scenario
 
 AXES = "xyz"
 BEYOND = 1.5
-"""Largest allowed input, divided by the largest step; larger inputs were not measured."""
+"""Largest allowed input, divided by the largest step: larger inputs were not measured."""
 FASTER = 1.25
-"""Required speed, divided by that of the desired trajectory or of the fence's wind."""
+"""Required speed, divided by the speed of the reference or of the fence's wind."""
 DIGITS = 4
 
 
@@ -124,7 +124,7 @@ def _rounded(number: float) -> float:
 
 
 def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbers]) -> list[float]:
-    """Bounds of the input [m/s]: sufficient for the desired trajectory and the fence's wind,
+    """Bounds of the input [m/s]: sufficient for the reference and the fence's wind,
     otherwise within the measured range.
     """
     wind_mps = flown.fence.wind_mps if flown.fence.is_there else 0.0

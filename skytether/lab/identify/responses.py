@@ -10,10 +10,10 @@ from skytether.lab.identify.steps import FlownStep
 from skytether.shared.base.units import SECOND_NS
 
 LOOKBACK = 2.0
-"""Time over which earlier inputs are included in a response, in step durations."""
+"""Time before a step from which earlier inputs are included in its response, in step durations."""
 LEAD = 0.25
 """Time before a step from which measurements are included, in step durations. Without a dead time
-they are the only data that separate gain from wind.
+only these measurements distinguish the gain from wind.
 """
 SAMPLES_MIN = 10
 

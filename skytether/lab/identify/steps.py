@@ -28,7 +28,7 @@ HOMEWARD_S = 15.0
 """Longest time for the way home [s]; steady wind may keep a vehicle away."""
 HOLD_MIN_S, HOLD_MAX_S = 3.0, 6.0
 STEP_MPS = 0.5
-"""Size of step if the desired trajectory is at rest [m/s]."""
+"""Height of the velocity steps if the reference is at rest [m/s]."""
 STEP_MIN_MPS = 0.05
 FAST = 1.3
 """Safety factor on the predicted distance of a step."""
@@ -61,10 +61,10 @@ def reference_speeds(scenario: Scenario) -> list[float]:
 
 
 def default_speeds(scenario: Scenario) -> tuple[float, ...]:
-    """Default size of step on each axis [m/s], similar to the speeds of the later flight.
+    """Default height of the velocity steps on each axis [m/s], similar to speeds of later flights.
 
-    The largest speed of the desired trajectory on the axis, but at least half of its largest speed
-    on any axis: on an axis without motion, feedback still causes inputs.
+    It is the reference's largest speed on the axis, but at least half of its largest speed on any
+    axis: on an axis without motion, feedback still causes inputs.
     """
     speeds = reference_speeds(scenario)
     least = max(speeds) / 2.0 or STEP_MPS
@@ -74,7 +74,7 @@ def default_speeds(scenario: Scenario) -> tuple[float, ...]:
 
 
 def default_hold_s(scenario: Scenario) -> float:
-    """Default time after a step, in which a vehicle similar to the model settles [s]."""
+    """Default time for which a step is held [s]; a vehicle similar to the model settles in it."""
     terms = scenario.terms()
     slowest = max(4.0 * t + late for t, late in zip(terms.tau_s, terms.dead_time_s, strict=True))
     return round(min(max(slowest, HOLD_MIN_S), HOLD_MAX_S), 2)

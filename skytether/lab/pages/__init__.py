@@ -6,6 +6,6 @@
     comparison     the contents of `skytether compare`
     keys_document  docs/keys.md, made from the keys of a scenario
 
-They are made from summaries and records of `lab.engine`. The commands write them to files, except
+Pages are made from summaries and records of `lab.engine`. The commands write them to files, except
 the pictures of sweeps, which `figures` writes itself.
 """

@@ -71,7 +71,7 @@ ABOUT = (
 
 UNDECIDED = "too few flights to tell"
 SIMILAR = 2 / 3
-"""Largest share of the contenders that may equal the best; if it is larger, none is marked.
+"""Largest share of contenders marked as equal to the best; if more are equal, none is marked.
 """
 
 
@@ -170,7 +170,7 @@ def leaders_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _ratio_row(found: tuple[float, float, float] | None) -> dict[str, float | None]:
-    """CSV cells of a ratio and the ends of its interval, empty if there is none; see `ratio`."""
+    """CSV cells of a ratio and the ends of its interval; empty without a ratio, see `ratio`."""
     return dict(zip(("ratio", "ratio_low", "ratio_high"), found or (None,) * 3, strict=True))
 
 
@@ -330,7 +330,7 @@ def _draw_curve(
     points: Sequence[ContenderRuns],
     style: tuple[str, str],
 ) -> None:
-    """Draw the RMSE of a contender over each of SPENT, with 95 % bands.
+    """Draw the RMSE of a contender over each figure of SPENT, with 95 % bands.
 
     A contender that sends no packets is a horizontal line.
     """

@@ -47,7 +47,7 @@ STYLES: Mapping[str, Mapping[str, Any]] = {
 }
 """Line style of each method; methods can be distinguished without colour."""
 RATIO_LOG = 20.0
-"""Ratio of the largest to the smallest value above which an axis is logarithmic."""
+"""An axis is logarithmic if the largest value is more than this multiple of the smallest."""
 
 Samples = Mapping[str, tuple[Scenario, Sequence[Record]]]
 
@@ -186,7 +186,7 @@ DECAY, EPSILON = "decay rate λ [1/s]", "tolerance ε"
 def maps(flown: CellSummaries, here: ControlConfig) -> Plate:
     """Fig. 5: RMSE and event ratio over the decay rate λ and the tolerance ε.
 
-    A cross marks the λ and ε of `here`, which are the paper's.
+    A cross marks the paper's λ and ε, taken from the scenario `here`.
     """
     from scipy import stats  # takes a second to import
 
@@ -330,7 +330,7 @@ def curve(study: Study, cells: Cells) -> Plate:
 
 def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
     """Number of values of the parameter at which periodic sending is better than the event trigger,
-    and number at which it is worse.
+    and number of values at which periodic sending is worse.
     """
     signs = [
         periodic_wins(cells[value, EVENT], cells[value, PERIODIC]) for value in study.axis.values

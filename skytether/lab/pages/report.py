@@ -53,9 +53,9 @@ class Reproduction:
     table: tuple[Study, Cells]
     curves: Sequence[tuple[Study, Cells]]
     maps: CellSummaries
-    """Summaries of Fig. 5, by λ and ε."""
+    """Summaries of the flights for Fig. 5, by λ and ε."""
     periods: CellSummaries
-    """Summaries of periodic sending, for Fig. 5 as curves, by period."""
+    """Summaries of flights with periodic sending, by period, for the curves of Fig. 5."""
     delay_ms: Array
     """Delay of each packet over UDP, measured and drawn by netem [ms]; shape (packets, 2)."""
     real: Mapping[str, Real]
@@ -142,7 +142,7 @@ def traffic_table(columns: Mapping[str, MethodFlights]) -> Table:
 
 
 SENT_BY = ("uplink_above", "uplink_due")
-"""Figures of plans sent, by cause, see `shared.telemetry.sent.SentBy`."""
+"""Names of the figures that count the plans sent by cause, see `shared.telemetry.sent.SentBy`."""
 REAL = {
     "column": ("column", ""),
     "UDP": ("rmse_xy_udp", ".4f"),
