@@ -44,7 +44,7 @@ class Explanation:
     nearness: Nearness | None = None
     """Distances of a double from the recorded flight; None for a flight in virtual time."""
     curves: tuple[tuple[str, CaseOutcome], ...] = ()
-    """Flights drawn for comparison: without a part of the cause, and with a remedy."""
+    """Label and outcome of flights to draw: without a part of the cause, and with a remedy."""
 
     def __str__(self) -> str:
         said = words.text(self.moments, self.moment, self.cause, self.rescues, self.remedies)

@@ -92,7 +92,7 @@ class CaseOutcome:
     """Time of flight at the first packet of each lane [s]."""
     separation_s: Array
     separation_m: Array
-    """Smallest distance between two vehicles of a mission at those times [m]."""
+    """Smallest distance between two vehicles of a mission at the times `separation_s` [m]."""
     failure: str
     """Reason why a vehicle could not fly; empty if all flew."""
     failed_s: float

@@ -89,7 +89,7 @@ def moments(flown: CaseOutcome, perfect: CaseOutcome, scenario: Scenario) -> lis
 
 
 def worst(found: Sequence[Moment]) -> Moment:
-    """Default moment to explain: the gravest kind, then the largest deviation from usual."""
+    """Default moment to explain: of the gravest kind, the largest deviation from `usual`."""
 
     def weight(each: Moment) -> tuple[int, float]:
         return WEIGHTS[each.kind], abs(each.figure - each.usual)
@@ -176,7 +176,7 @@ def _of_vehicle(track: Track, usual: Track | None, scenario: Scenario) -> Iterat
 
 
 def _levels(figure: float, usual: float) -> tuple[float, float]:
-    """`level` and `calm` of a moment: `usual` plus a half, or a quarter, of the excess."""
+    """`level` and `calm` of a moment: `usual` plus half, and plus a quarter, of the excess."""
     return usual + 0.5 * (figure - usual), usual + 0.25 * (figure - usual)
 
 
@@ -224,7 +224,7 @@ def _alive(flown: CaseOutcome) -> Iterator[Moment]:
 
 
 def _sent_s(outcome: CaseOutcome) -> Array:
-    """Times at which the server sent a plan [s]; once for all paths."""
+    """Times at which the server sent a plan [s]; copies of a plan on several paths count once."""
     return np.unique(outcome.packets.time_s[outcome.packets.is_plan])
 
 

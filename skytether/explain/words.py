@@ -146,7 +146,7 @@ def _row(parts: Sequence[CausePart], moment: Moment) -> list[str]:
 
 def _without(parts: Sequence[CausePart], moment: Moment) -> str:
     needed = sum(part.is_needed for part in parts)
-    if math.isnan(parts[0].error_m) and not needed:  # not flown yet
+    if math.isnan(parts[0].error_m) and not needed:  # not flown without it yet
         return ""
     if len(parts) > 1:
         return f"{needed} of {len(parts)} needed by itself"

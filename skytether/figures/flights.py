@@ -31,7 +31,7 @@ def check(path: Path, *others: str) -> None:
         others: suffixes accepted beside FORMATS.
 
     Raises:
-        ConfigError: the suffix is not accepted; the message names the accepted ones.
+        ConfigError: the suffix is not accepted; the message names the accepted suffixes.
         ModuleNotFoundError: matplotlib is not installed.
     """
     accepted = (*FORMATS, *others)
@@ -142,7 +142,7 @@ def fleet(
 ) -> None:
     """Draw a fleet: all paths over the reference, and the spread of the tracking error.
 
-    For a mission it draws paths, zones, and the smallest distance between two vehicles over time.
+    For a mission, draw paths, zones, and the smallest distance between two vehicles over time.
 
     Args:
         path: file to write, in one of FORMATS.

@@ -27,9 +27,9 @@ class Table:
     heading: Sequence[str]
     rows: Sequence[Sequence[str]]
     bold: Collection[tuple[int, int]] = ()
-    """Rows and columns of cells in bold type."""
+    """Row and column number of each cell in bold type."""
     own: Collection[int] = ()
-    """Rows of the user's own contenders."""
+    """Row numbers of the user's own contenders."""
     is_grouped: bool = True
 
     @property

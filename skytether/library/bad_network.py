@@ -32,7 +32,7 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         with skytether.bad_network("loss(0.1) & constant(0.05)", to=("127.0.0.1", 5000)) as net:
             client.sendto(b"hello", net.address)
 
-    In a `with` block it runs in a thread, in an `async with` block as a task of the event loop.
+    A `with` block runs the network in a thread, an `async with` block as a task of the event loop.
 
     Args:
         network: impairments of both directions, as in "constant(50ms) & loss(10%)".

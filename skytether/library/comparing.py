@@ -43,8 +43,8 @@ def compare(
         workers: see `skytether.sweep`.
 
     Returns:
-        For each case, contender and packet budget, the flights at the best threshold; no flights
-        with the reference aboard. Keys: `case`, `contender`, `budget` [1/s], `threshold`, `report`.
+        For each case, contender and packet budget, the flights at the best threshold; the baseline
+        is left out. Keys: `case`, `contender`, `budget` [1/s], `threshold`, `report`.
 
     Raises:
         ConfigError: a contender or an argument is invalid, or `out` contains another comparison.

@@ -129,7 +129,7 @@ class Flight:
 
     @property
     def failure(self) -> Failure | None:
-        """Event after which the vehicle could not fly; None after a flight to the end."""
+        """Event because of which the vehicle could not fly to the end; None if it could."""
         return self.record.failure
 
     @extras.named()
@@ -197,7 +197,7 @@ class Flight:
 
     @extras.named()
     def to_pandas(self, part: str = "client") -> "pandas.DataFrame":
-        """Table of a part, one column per number, with axis and unit in its name.
+        """Table of a part; a column for each number, with the axis and the unit in the name.
 
         Args:
             part: "client" for the vehicle's steps, "server", "netem" for packets, or "plan".
@@ -274,6 +274,6 @@ def table(flights: Iterable[Flight]) -> "pandas.DataFrame":
 
 
 def values(summary: Summary) -> dict[str, Any]:
-    """Single-valued fields of a summary: all but the tables `modes` and `drops`."""
+    """Single-valued fields of a summary: all fields except the tables `modes` and `drops`."""
     fields = msgspec.structs.asdict(summary)
     return {name: value for name, value in fields.items() if name not in ("modes", "drops")}

@@ -36,7 +36,7 @@ class Swept:
     def mean(self, figure: str) -> Estimate:
         """Mean of a figure over the flights, and half the width of its 95 % confidence interval.
 
-        The mean is None if no flight has the figure, the interval if fewer than two have it.
+        The mean is None if no flight has the figure, the interval if fewer than two flights do.
 
         Raises:
             KeyError: `figure` is not a numeric figure of a summary.

@@ -1,6 +1,6 @@
 """Parameter values on the wire: a float, whatever the parameter's type.
 
-ArduPilot converts an integer to a float; PX4 sends its bits as those of a float
+ArduPilot converts an integer to a float; PX4 sends the integer's bits as those of a float
 (`MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST`, `…_BYTEWISE`).
 """
 

@@ -1,4 +1,4 @@
-"""STATUSTEXT messages: texts of 50 bytes, longer ones in chunks that are reassembled."""
+"""STATUSTEXT messages: texts of up to 50 bytes; longer texts come in chunks to reassemble."""
 
 from collections import OrderedDict
 
@@ -8,7 +8,7 @@ from skytether.mavlink.dialect import dialect
 CHUNK_BYTES = 50
 """Longest text of a message [B]."""
 UNFINISHED_MAX = 8
-"""Largest number of unfinished texts that are kept; a new one replaces the oldest."""
+"""Largest number of unfinished texts that are kept; a further text replaces the oldest text."""
 CHUNKS_MAX = 8
 
 

@@ -62,7 +62,7 @@ class EndOptions:
     """Options of both commands."""
 
     keys: Path | None = None
-    """File with the keys, made by `skytether keygen`. Without it the link is plaintext, which is
+    """File with the keys, made by `skytether keygen`. Without keys the link is plaintext, and
     allowed only on this machine."""
     insecure: bool = False
     """Allow a plaintext link to another machine: anybody on the network can then control the
@@ -88,7 +88,7 @@ class ServeOptions(EndOptions):
     bind: Annotated[tuple[str, ...], Argument(metavar="HOST:PORT", append=True)] = ()
     """HOST:PORT to listen on for robots, by default 127.0.0.1:47010. May be repeated."""
     patience: str = "30s"
-    """Longest time for a reply of the policy server; then its connection is reopened."""
+    """Longest time for a reply of the policy server; after it, the connection is reopened."""
     give_rows: bool = False
     """Add the robot's remaining rows to each observation, as keys delay_steps, coming and
     committed."""
@@ -101,16 +101,16 @@ class JoinOptions(EndOptions):
     server: Annotated[str, Argument(positional=True, metavar="HOST:PORT")] = ""
     """HOST:PORT of `skytether policy serve`."""
     actions: Literal["absolute", "delta", ""] = ""
-    """Type of the actions, which sets the hold action, used when no row remains: the last row for
-    absolute, zeros for delta. Required."""
+    """Type of the actions: absolute or delta. Required. The hold action, executed when no row
+    remains, is the last row for absolute actions, and zeros for delta actions."""
     listen: str = "127.0.0.1:8000"
     """HOST:PORT to listen on for the robot program, which connects with openpi's client."""
     deadline: str = "150ms"
     """Longest time from a call to its answer, except for the first call."""
     hold: str = "1s"
-    """Longest time for which calls are answered with the hold action; then with an error."""
+    """Longest time for which calls are answered with the hold action; later calls get an error."""
     begin: str = "60s"
-    """Longest time from the first call to its answer; some policies compile at first."""
+    """Longest time from the first call to its answer; some policies compile in the first call."""
     step: str | None = None
     """Length of a control step, in which the program executes a row, as in 20ms; by default the
     measured time from an answer to the next call, divided by --rows."""
@@ -124,8 +124,8 @@ class JoinOptions(EndOptions):
     than N rows will remain when its action chunk arrives."""
     merge: Literal["clock", "average", "drtc"] = "clock"
     """Rule for a step with rows in several chunks: clock, the row of the newest chunk; average,
-    LeRobot's weighted average; drtc, DRTC's rule. The last two count steps by executed rows, the
-    first by the clock."""
+    LeRobot's weighted average; drtc, DRTC's rule. clock counts steps by the clock; average and drtc
+    count executed rows."""
     actions_key: str = "actions"
     """Key of the actions in the policy's replies."""
     resize: Annotated[int | None, Argument(metavar="PIXELS")] = None
@@ -137,8 +137,8 @@ class JoinOptions(EndOptions):
     """Key of an image that is sent without JPEG compression, as in observation/image. May be
     repeated."""
     path: Annotated[tuple[str, ...], Argument(metavar="LOCAL=HOST:PORT", append=True)] = ()
-    """Path to the server, in place of HOST:PORT; with several, each datagram is sent over all of
-    them. LOCAL is an interface or an address of this machine, or empty."""
+    """Path to the server, in place of HOST:PORT; with several paths, each datagram is sent over
+    every path. LOCAL is an interface or an address of this machine, or empty."""
     robot: Annotated[int, Argument(name="id")] = 1
     """Number of this robot and its key, 0 to 65535, unique at the server."""
     record: Path | None = None

@@ -20,7 +20,7 @@ QUIET_NS = 300 * MILLISECOND_NS
 """Time without a further part after which an incomplete message is reported [ns]; longer than the
 time between two datagrams at the smallest send rate."""
 REMEMBERED_MAX = 64
-"""Number of newest sent messages whose reports are evaluated, and of reports that may wait."""
+"""Largest number of sent messages whose reports are awaited, and of reports that are not sent."""
 PART_HEAD_BYTES = 40
 """Size of header and encryption of a datagram with a part [B]."""
 
@@ -37,7 +37,7 @@ class _Sent:
 
 @dataclass(slots=True)
 class _Coming:
-    """Message of which parts have arrived and that is not reported yet."""
+    """Message whose first parts have arrived, and on which no report has been sent."""
 
     number: int
     expected: int
@@ -63,7 +63,7 @@ class Exchange:
         self._queue: dict[int, deque[Part]] = {}
         """Parts to be sent, by stream."""
         self._next: dict[int, tuple[bytes, bool]] = {}
-        """Message of each stream to be sent after these parts, and whether it is urgent."""
+        """Next message of each stream, sent after these parts, and whether it is urgent."""
         self._replies: deque[bytes] = deque(maxlen=REMEMBERED_MAX)
         """Encoded reports to be sent."""
         self._sent: OrderedDict[tuple[int, int], _Sent] = OrderedDict()

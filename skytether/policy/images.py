@@ -1,7 +1,7 @@
 """Images of observations: resized and JPEG-compressed at the robot end, decoded at the policy end.
 
-An image is an array of uint8 with three axes, of which the first or the last has length 3 and the
-others SIDE_MIN to SIDE_MAX. Its key is its path in the observation, as in `images/wrist`.
+An image is an array of uint8 with three axes. The first or the last axis has length 3, the others
+SIDE_MIN to SIDE_MAX. An image's key is its path in the observation, as in `images/wrist`.
 """
 
 import io

@@ -188,8 +188,8 @@ class Robot:
 
     Args:
         server: HOST:PORT of `skytether policy serve`, or of `serve`.
-        actions: type of the actions, which sets the hold action: "absolute", the last row;
-            "delta", zeros.
+        actions: type of the actions; without a row the robot holds: "absolute" repeats the last
+            row, "delta" has zeros.
         deadline: longest time from a call to its answer, except for the first call [s].
         step: length of a control step [s]; None: measured between the calls.
         rows: number of rows that the program executes of each answer.
@@ -310,7 +310,7 @@ class Robot:
             self._is_connected = True
         self._say(FrameType.MESSAGE.value + content)
         self._unread += 1
-        while self._unread:  # more than one if an earlier call was interrupted
+        while self._unread:  # several answers if an earlier call was interrupted
             answer = self._answer()
             self._unread -= 1
         if answer[:1] == FrameType.ERROR:

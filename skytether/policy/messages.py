@@ -72,13 +72,13 @@ class PartMessage(NamedTuple):
 
 
 class Report(NamedTuple):
-    """Report on a message, sent when all its parts have arrived or no more are expected."""
+    """Report on a message, sent when all its parts have arrived or no further part is expected."""
 
     session: U32
     stream: Stream
     number: U63
     came: U16
-    """Number of received parts; 0: a keep-alive, where `number` is 1 if the robot end has the
+    """Number of received parts; 0 marks a keep-alive, whose `number` is 1 if the robot end has the
     metadata."""
     bytes: U32
     """Bytes of the received parts, headers included [B]."""

@@ -2,9 +2,9 @@
 
 Delay-based congestion control: the queueing delay is the one-way delay minus its minimum over the
 last LEAST_NS. Above QUEUE_HIGH_NS the send rate is reduced below the received rate. Below
-QUEUE_LOW_NS it is raised if it limited the sender. Loss alone does not reduce it, because on radio
-links loss does not imply a queue. Compare LEDBAT (RFC 6817), NADA (RFC 8698) and Google's
-congestion control.
+QUEUE_LOW_NS the send rate is raised if it limited the sender. Loss alone does not reduce the send
+rate, because on radio links loss does not imply a queue. Compare LEDBAT (RFC 6817), NADA (RFC 8698)
+and Google's congestion control.
 """
 
 from collections import deque
@@ -18,7 +18,7 @@ RATE_MAX = 125_000_000.0
 BURST_BYTES = 3600
 """Largest burst: bytes that may be sent back to back [B]."""
 QUEUE_HIGH_NS, QUEUE_LOW_NS = 40 * MILLISECOND_NS, 15 * MILLISECOND_NS
-"""Queueing delays above which the send rate is reduced, and below which it is raised [ns]."""
+"""Queueing delay above which the send rate is reduced, and below which the rate is raised [ns]."""
 LOWERED_EVERY_NS = 200 * MILLISECOND_NS
 """Shortest time between two reductions [ns]."""
 LOWER, RISE = 0.85, 1.08

@@ -7,7 +7,7 @@ Parts of the blocks are sent interleaved, so that a burst of losses is spread ov
 and 99.6 % with 4 parity parts.
 
 Parts are not retransmitted. The receiver keeps the newest HELD_MAX incomplete messages. When a
-message is complete, it discards the older ones, which the newer message replaces.
+message is complete, the receiver discards older messages, because the newer one replaces them.
 """
 
 from collections.abc import Callable
@@ -104,14 +104,14 @@ class Reassembly:
         self.newest = -1
         """Sequence number of the newest complete message; -1: none."""
         self.given_up = 0
-        """Number of messages discarded incomplete, because newer ones arrived."""
+        """Number of incomplete messages that were discarded, because newer messages arrived."""
 
     def accept(self, part: Part) -> Whole | None:
         """Accept a part; returns the message if this part completes it.
 
         Raises:
             ProtocolError: the part's fields are invalid or differ from those of the message's other
-                parts, it is a duplicate, or a newer message is already complete.
+                parts, the part is a duplicate, or the message or a newer one is already complete.
         """
         _check(part)
         if part.number <= self.newest:

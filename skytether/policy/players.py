@@ -34,7 +34,7 @@ class Chunk(NamedTuple):
     first: int | None = None
     """Step of the first row, as the player counts steps; None: step of the newest observation."""
     thought_ns: int | None = None
-    """Computation time of the chunk [ns], to repeat a run; None: `thinking` of the environment."""
+    """Computation time of the chunk [ns], to repeat a run; None: the environment's `thinking`."""
 
 
 class Held(NamedTuple):
@@ -117,8 +117,8 @@ class Queue(Player):
     """Player that executes a queue of rows in order, as in LeRobot's asynchronous inference.
 
     Steps are counted by executed rows, not by the clock: the count stops while the queue is empty.
-    When a chunk arrives, its rows for steps already executed are skipped, and the others replace
-    the queue. If both have a row for a step, the newer row is executed, or a weighted average.
+    When a chunk arrives, its rows for steps already executed are skipped, and its other rows
+    replace the queue. With "average", a step in both gets a weighted average of the two rows.
 
     Args:
         merge: rule for steps with an older and a newer row.
@@ -166,8 +166,8 @@ class Queue(Player):
 class Freshest(Player):
     """Player that executes the newest row of each step, as distributed real-time chunking (DRTC).
 
-    Steps are counted by executed rows, as in `Queue`. A chunk older than the newest received one is
-    ignored. Rows of a newer chunk replace rows of the same steps, except steps already executed;
+    Steps are counted by executed rows, as in `Queue`. A chunk older than the newest received chunk
+    is ignored. Rows of a newer chunk replace rows of the same steps, except steps already executed;
     rows of other steps are kept.
     """
 

@@ -3,7 +3,7 @@
 The program is connected through the local connection (socket 1): a websocket with openpi's
 protocol, or `Robot.infer`. A call is an observation. It is answered
 
-- with its own action chunk, as soon as that arrives;
+- with its own action chunk, as soon as the chunk arrives;
 - at the deadline, with the remaining rows of earlier chunks from the present step on, or at once if
   the newest chunks took longer than the deadline;
 - if no row remains, with the hold action for at most `hold_ns`, then with an error, after which the
@@ -48,7 +48,7 @@ LINE = 1
 SILENCE_NS = 3 * SECOND_NS
 """Time without a datagram after which the robot end sends HELLO again [ns]."""
 ALIVE_NS = SECOND_NS
-"""Time without a datagram sent after which a keep-alive is sent [ns]."""
+"""Time after the last sent datagram at which a keep-alive is sent [ns]."""
 AGAIN_NS = SECOND_NS
 """Time between repetitions of the first observation [ns]."""
 STEP_NS_FIRST = 50 * MILLISECOND_NS
@@ -56,8 +56,8 @@ STEP_NS_FIRST = 50 * MILLISECOND_NS
 STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
 """Bounds of the measured step length [ns]: a pause of the program is not a long step."""
 MEASURED, DELAYS, ASKED_MAX = 9, 64, 1024
-"""Number of newest call intervals evaluated, of chunk delays evaluated, and of sent observations
-whose chunks are accepted."""
+"""Number of newest intervals between calls that give the step length, of newest chunk delays that
+are evaluated, and of newest observations whose chunks are accepted."""
 ROWS_SENT = 64
 """Largest number of next rows that are sent with an observation."""
 KINDS = (Kind.FRESH, Kind.REST, Kind.HOLD, Kind.ERROR)
@@ -68,10 +68,10 @@ class FrameType(bytes, Enum):
 
     OPENED = b"+"
     CLOSED = b"-"
-    """Followed by the reason, or nothing."""
+    """The reason follows, or nothing."""
     MESSAGE = b"m"
     ERROR = b"e"
-    """Followed by the error message."""
+    """The error message follows."""
 
 
 class AnsweredCall(NamedTuple):
@@ -108,18 +108,18 @@ class RobotOptions:
     """Key of the actions in the policy's reply."""
     step_ns: int | None = None
     """Length of a control step [ns]; None: measured as the time from an answer to the next call,
-    divided by `rows`. Required with `plays_on`, where that time does not measure the step."""
+    divided by `rows`. Required with `plays_on`, because that time then does not measure steps."""
     rows: int = 1
     """Number of rows that the program executes of each answer."""
     plays_on: bool = False
     """Whether the robot continues to execute rows during a call."""
     spare_rows: int | None = None
     """An observation is sent only if fewer rows than this will remain when its chunk arrives;
-    None: each is sent."""
+    None: every observation is sent."""
     rate_max: float = RATE_MAX
     """Largest send rate [B/s]."""
     player: Callable[[], Player] = Clocked
-    """Makes the rule that chooses the row of each step."""
+    """Function that makes a player, the rule that chooses the row of each step."""
 
 
 @dataclass(slots=True)
@@ -130,7 +130,7 @@ class _Call:
     message: bytes
     """Serialized observation; empty if it is not sent."""
     again_ns: int
-    """Time at which the observation is sent again, before the first chunk [ns]."""
+    """Time at which the observation is sent again if no chunk has arrived yet [ns]."""
     sent: Any = None
     """Observation with compressed images; None if it is not sent."""
 
@@ -159,7 +159,7 @@ class _Program:
     newest: int = -1
     """Number of the newest call whose chunk has arrived; -1: none."""
     made_ns: int = -1
-    """Time of that call [ns]."""
+    """Time of the call `newest` [ns]."""
     answered_ns: int | None = None
     """Time of the last answer [ns]."""
     has_metadata: bool = False
@@ -173,8 +173,8 @@ class RobotEnd(Endpoint):
         servers: address of the policy end on each path, by socket number, without LINE.
         link: encryption of the datagrams, see `client.link`.
         boot_id: random number of this run.
-        compress: compresses an observation before it is sent, see `images.Compressor`.
-        on_answer: called after each answer; None: nothing is kept for it.
+        compress: function that compresses an observation before sending, see `images.Compressor`.
+        on_answer: called after each answer; None: answers are not kept.
     """
 
     def __init__(
@@ -194,7 +194,7 @@ class RobotEnd(Endpoint):
         self._on_answer = on_answer
         self._exchange: Exchange | None = None
         self._session = (0, 0)
-        """Number of the session, and of the policy end's run."""
+        """Number of the session, and number of the policy end's run."""
         self._hello_ns: int | None = 0
         """Time of the next HELLO [ns]; None during a session."""
         self._heard_ns = self._sent_ns = 0
@@ -207,8 +207,8 @@ class RobotEnd(Endpoint):
         """Sent observations, by call number."""
         self._calls = self._connections = 0
         self._waits = True
-        """Whether the newest chunk arrived within the deadline; if not, a call is answered at once
-        while rows remain."""
+        """Whether the newest chunk arrived within the deadline; otherwise calls are answered at
+        once while rows remain."""
         self._delays_ns: deque[int] = deque(maxlen=DELAYS)
         """Newest times from an observation to its chunk [ns]."""
         self._counts = Counter[Kind]()
@@ -341,7 +341,7 @@ class RobotEnd(Endpoint):
                 self._hear_call(self._program, said[1:], now_ns)
 
     def _greet(self) -> None:
-        """Send the policy's metadata to the program, which completes its connection."""
+        """Send the policy's metadata to the program; the metadata complete its connection."""
         program = self._program
         if program and self._metadata is not None and not program.has_metadata:
             program.has_metadata = True
@@ -349,7 +349,7 @@ class RobotEnd(Endpoint):
 
     def _hear_call(self, program: _Program, data: bytes, now_ns: int) -> None:
         options, schedule = self._options, program.schedule
-        if self._call:  # the program has not waited for its answer; each call gets one
+        if self._call:  # the program did not wait for the answer; every call gets an answer
             self._answer(Kind.REST, now_ns)
         if program.answered_ns is not None and options.step_ns is None:
             program.intervals_ns.append(now_ns - program.answered_ns)
@@ -392,7 +392,7 @@ class RobotEnd(Endpoint):
         if self._exchange:
             self._exchange.send(OBSERVATION, message)
         before = self._asked.get(call.number - 1)
-        if before and program.newest < call.number - 1:  # its chunk has not arrived yet
+        if before and program.newest < call.number - 1:  # that call's chunk has not arrived
             self._waits &= now_ns - before.began_ns <= options.deadline_ns
         if not (self._waits or call.is_first) and schedule.left(now_ns=now_ns):
             self._answer(Kind.REST, now_ns)
@@ -456,7 +456,7 @@ class RobotEnd(Endpoint):
             try:
                 kind, reply, left = schedule.answer(kind, now_ns=now_ns)
                 message = values.pack(reply)
-            except Exception as refused:  # such as one nested too deeply; the call is answered
+            except Exception as refused:  # such as a reply nested too deeply; the call is answered
                 error = f"the policy's reply cannot be sent: {refused}"
         if kind is Kind.HOLD and not error:
             if reply is None or now_ns - since_ns > self._options.hold_ns:

@@ -40,7 +40,7 @@ class Kind(StrEnum):
 class Answer(NamedTuple):
     kind: Kind
     reply: Any
-    """Newest reply from the present row on; None before the first."""
+    """Newest reply, from the present row on; None before the first reply."""
     left: int
     """Number of rows of `reply` computed by the policy; the others are the hold action."""
 
@@ -53,7 +53,7 @@ class Schedule:
         actions: see `Actions`.
         key: key of the actions in the policy's reply.
         step_ns: length of a control step [ns].
-        rows: number of rows that the program executes of each answer; None: counted by the clock.
+        rows: number of rows that the program executes of each answer; None: the clock decides.
         late_ns: longest allowed delay of a row after its planned time [ns].
         began_ns: time of step 0 [ns].
     """
@@ -147,9 +147,9 @@ class Schedule:
         """Accept a chunk.
 
         Args:
-            call: number of the call that it answers; numbers increase.
-            first: number of the step of its observation, see `number`.
-            stood_ns: `stood_ns` at the time of its observation [ns].
+            call: number of the call that the chunk answers; numbers increase.
+            first: number of the step of the chunk's observation, see `number`.
+            stood_ns: `stood_ns` at the time of the chunk's observation [ns].
             reply: the policy's reply.
 
         Raises:
@@ -196,7 +196,7 @@ class Schedule:
         """Newest reply from the present row on, padded to its length with the hold action.
 
         Args:
-            kind: kind of the answer if rows remain; else it is HOLD.
+            kind: kind of the answer if rows remain; otherwise the kind is HOLD.
         """
         if self._reply is None:
             return Answer(Kind.HOLD, None, 0)
@@ -237,7 +237,7 @@ def rows_of(reply: Any, key: str) -> NDArray[Any]:
 
 
 def _cut(value: Any, length: int, first: int) -> Any:
-    """Value with each array of `length` rows shifted by `first` rows, its last row repeated."""
+    """Value whose arrays of `length` rows are shifted by `first` rows; the last row is repeated."""
     if isinstance(value, dict):
         return {name: _cut(each, length, first) for name, each in value.items()}
     if isinstance(value, np.ndarray) and value.ndim and len(value) == length and first:

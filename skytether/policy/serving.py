@@ -39,7 +39,7 @@ ROBOTS_MAX = 64
 SILENCE_NS = 10 * SECOND_NS
 """Time without a datagram after which a robot's session ends [ns]."""
 PATH_NS = 3 * SECOND_NS
-"""Time without a datagram from an address after which no datagram is sent to it [ns]."""
+"""Time without a datagram from an address after which no datagram is sent to the address [ns]."""
 PATHS_MAX = 4
 """Largest number of addresses of a robot; the least recently used are discarded."""
 AGAIN_NS = SECOND_NS
@@ -73,7 +73,7 @@ class _Robot:
     answered: tuple[int, bytes] = (-1, b"")
     """Number of the newest call with a chunk, and the message with that chunk."""
     asked_ns: int = 0
-    """Time at which the policy got the observation, or opening its connection began [ns]."""
+    """Time at which the policy got the observation, or its connection began to open [ns]."""
     is_open: bool = False
     """Whether the connection to the policy is open."""
     connection: int = 0
@@ -103,7 +103,7 @@ class PolicyEnd(Endpoint):
         gate: decryption and admission of robots, see `server.gate`.
         boot_id: random number of this run.
         draw: returns an unpredictable 32-bit number, used as session number.
-        patience_ns: longest computation time of the policy; then its connection is reopened [ns].
+        patience_ns: longest time for a reply of the policy; then the connection is reopened [ns].
         gives_rows: whether the keys `delay_steps`, `coming` and `committed` are added to an
             observation: the longest recent time from observation to chunk in control steps, the
             robot's remaining rows from the observation's step on, and the first `delay_steps` of
@@ -130,7 +130,7 @@ class PolicyEnd(Endpoint):
         self._unpacker = unpacker
         self._robots: dict[int, _Robot] = {}
         self._welcomed: dict[int, _Robot] = {}
-        """Robots, by number, that have sent only a HELLO, which may be a replay of an old one."""
+        """Robots by number that have sent only a HELLO; the HELLO may be a replay."""
         self._by_connection: dict[int, int] = {}
         """Number of the robot of each connection to the policy."""
         self._connections = 0
@@ -274,7 +274,7 @@ class PolicyEnd(Endpoint):
                 self._lose(number, robot, said[1:].decode(errors="replace"), now_ns)
                 return
             case _ if robot.thinking is None:
-                # Else each later observation would get the reply to the one before.
+                # Otherwise each later observation would get the reply to the observation before.
                 self._lose(number, robot, "reply without an observation", now_ns)
                 return
             case FrameType.MESSAGE:
@@ -342,7 +342,7 @@ class PolicyEnd(Endpoint):
         self._ask(robot, now_ns)
 
     def _ask(self, robot: _Robot, now_ns: int) -> None:
-        """Send the newest observation to the policy, if it is idle."""
+        """Send the newest observation to the policy, if the policy is idle."""
         if robot.waiting and robot.is_open and robot.thinking is None:
             robot.thinking, robot.waiting = robot.waiting, None
             robot.asked_ns = now_ns

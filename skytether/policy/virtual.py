@@ -38,15 +38,15 @@ CONNECTS_NS = 60 * SECOND_NS
 
 
 class NoActionError(RuntimeError):
-    """A call was answered with an error; the message gives the reason."""
+    """Error as the answer to a call; the message gives the reason."""
 
 
 class Emulated:
     """Robot program and policy at the two ends of an emulated network, in virtual time.
 
     Args:
-        policy: from an observation to the reply, a dict with an array `actions`; an exception is
-            an error of the policy.
+        policy: function from an observation to the reply, a dict with an array `actions`; an
+            exception counts as an error of the policy.
         options: options of the robot end.
         to_policy, to_robot: network impairments of each direction (`skytether list impairments`).
         thinking: computation time of the policy [s]; None: it never replies.
@@ -131,7 +131,7 @@ class Emulated:
         """
         before = len(self.answers)
         self.say(FrameType.MESSAGE.value + values.pack(observation))
-        # Each call is answered: by its deadline, or the first one within `begin_ns`.
+        # Each call is answered by its deadline; the first call is answered within `begin_ns`.
         self.run(self.now_ns + 3600 * SECOND_NS, lambda: len(self.answers) > before)
         said = self.answers[-1][1]
         if said[:1] == FrameType.ERROR:

@@ -1,7 +1,7 @@
 """Websocket connections to the robot program and to the policy server, with openpi's protocol.
 
 When a client connects, the server sends the policy's metadata. Each later message of the client is
-an observation, and each later message of the server a binary reply, or an error as text. Websocket
+an observation. Each later message of the server is a binary reply, or an error as text. Websocket
 compression is off at client and server, as in openpi.
 """
 
@@ -24,7 +24,7 @@ from skytether.shell.host.tcp import listen_tcp
 from skytether.shell.host.udp import from_kernel
 
 ANSWERS_MAX = 16
-"""Largest number of answers that a program has not read; then its connection is closed."""
+"""Largest number of answers that a program may leave unread; then its connection is closed."""
 PROGRAM = "program"
 Hear = Callable[[Datagram], None]
 Messages = asyncio.Queue[bytes | str]

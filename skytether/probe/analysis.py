@@ -42,7 +42,7 @@ LAGS = 20
 TOGETHER_NS = 2 * MILLISECOND_NS
 """Longest time for sending the packets of a train [ns]."""
 SPREAD_MIN_S = 1e-3
-"""Spread of a train above which it indicates a finite rate, not a busy machine [s]."""
+"""Spread of arrivals above which a train indicates a finite rate, not a busy machine [s]."""
 ARRIVED_MIN = 4
 """Smallest number of received packets for a train to count."""
 GROUPS_MIN, GROUPS_MAX = 4, 10
@@ -54,12 +54,12 @@ QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Clocks:
-    """Offset and drift of the listener's clock, relative to the prober's."""
+    """Offset and drift of the listener's clock, relative to the prober's clock."""
 
     offset_s: float
     """Offset at the first probe [s], assuming equal least delays in both directions."""
     drift: float
-    """Rate by which the listener's clock runs faster; 0 if no drift is significant."""
+    """Relative rate by which the listener's clock is faster; 0 if the drift is not significant."""
     drift_doubt: float
     least_sum_s: float
     """Sum of the two directions' least delays [s]."""
@@ -210,7 +210,7 @@ def lower_hull(x: Array, y: Array) -> tuple[Array, Array]:
 
 
 def highest(function: Callable[[float], float], low: float, high: float, steps: int = 100) -> float:
-    """Argument between two bounds at which a concave function is largest (golden section)."""
+    """Argument between two bounds that maximises a concave function, by golden-section search."""
     ratio = (sqrt(5.0) - 1.0) / 2.0
     left, right = high - ratio * (high - low), low + ratio * (high - low)
     at_left, at_right = function(left), function(right)
@@ -236,7 +236,7 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
 
     Args:
         time_s: times of sending, in the order of sending; shape (n,).
-        values: NaN for unknown values; shape (n,).
+        values: value of each packet, NaN if unknown; shape (n,).
 
     Returns:
         two arrays of shape (lags,), with fewer entries if there are few packets.
@@ -294,14 +294,14 @@ def wilson(share: float, count: float) -> tuple[float, float]:
 
 
 def bursts(lost: Flags) -> tuple[int, float]:
-    """Number of runs of lost packets, and their mean length in packets; 0 without any."""
+    """Number of runs of lost packets, and their mean length [packets]; both 0 without a loss."""
     edges = np.diff(lost.astype(np.int8), prepend=0)
     count = int((edges == 1).sum())
     return count, float(lost.sum()) / count if count else 0.0
 
 
 def reordered(way: Way) -> float:
-    """Share of packets that arrived after one sent later (RFC 4737)."""
+    """Share of packets that arrived after a packet that was sent later (RFC 4737)."""
     alone = way.came & (way.train < 0)
     came_ns = way.came_ns[alone]
     order = np.argsort(came_ns, kind="stable")

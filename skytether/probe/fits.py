@@ -29,7 +29,7 @@ COLUMNS = 50
 PAIRS_MIN = 20
 """Smallest number of packets for a fit."""
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
-"""Lower bound of a channel's redraw time, in mean times between packets, and upper bound [s]."""
+"""Bounds of a channel's redraw time: lower, in mean times between packets, and upper [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,15 +143,15 @@ def _paper(delay_s: Array) -> Found | None:
 
     # Slot lengths are tried on a uniform grid of 1/slot, on which all peaks are 1/span wide.
     inverse = np.linspace(1.0 / span, min(SLOTS / (4.0 * span), 1e3), SLOTS)
-    # Computes concentration(1 / inverse). Each exponential is the product of one for its row and
-    # one for its column, so that a thirtieth of the exponentials suffices.
+    # Computes concentration(1 / inverse). Each exponential is the product of an exponential for its
+    # row and one for its column, so that a thirtieth of the exponentials suffices.
     rows, columns = inverse[::COLUMNS], inverse[:COLUMNS] - inverse[0]
     waves = [np.exp(2j * pi * np.outer(each, sample)) for each in (rows, columns)]
     scores = np.abs(waves[0] @ waves[1].T).ravel() / len(sample)
     good = np.flatnonzero(scores > max(0.9 * float(scores.max()), 0.8))
     if not len(good):
         return None
-    # A fraction of the true slot length scores as high: take the longest of the best ones.
+    # A fraction of the true slot length scores as high: take the longest of the best lengths.
     run = good[: int(np.argmax(np.diff(good, append=10**9) > 1)) + 1]
     peak = inverse[run[np.argmax(scores[run])]]
     step = inverse[1] - inverse[0]
@@ -186,13 +186,13 @@ def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
     """Fit models of losses; the best is first; empty if nothing or everything was lost.
 
     The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and
-    loses every packet while it is bad. Its state is not redrawn between two packets with
-    probability exp(-Δt / cell), `cell` being the mean time from one redraw to the next. A bad
-    period lasts cell / (1 - share) on average.
+    loses every packet while it is bad. With probability exp(-Δt / cell) it is not redrawn between
+    two packets at a distance Δt; `cell` is the mean time from one redraw to the next. A bad period
+    lasts cell / (1 - share) on average.
 
     Args:
         time_s: times of sending, in the order of sending; shape (n,).
-        lost: whether each was lost; shape (n,).
+        lost: whether each packet was lost; shape (n,).
     """
     count, lost_count = len(lost), int(np.sum(lost))
     if count < PAIRS_MIN or lost_count in (0, count):
@@ -230,7 +230,7 @@ def _at_cell(likelihood: Callable[[float, float], float], cell_s: float, share: 
 
 
 _TURNS = ((True, True), (True, False), (False, True), (False, False))
-"""Whether a packet was lost, and whether the next one was."""
+"""Whether a packet was lost, and whether the next packet was lost."""
 
 
 def _gilbert(groups: list[Array], share: float, cell_s: float) -> float:

@@ -36,7 +36,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Largest number of measurements at once; `Listener._gives_way` chooses one to end for another."""
+"""Largest number of measurements at once; for a further one, `Listener._gives_way` ends another."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
@@ -141,10 +141,10 @@ class Listener(Endpoint):
         return session
 
     def _gives_way(self, peer: Address, now_ns: int) -> bytes | None:
-        """Id of the session to end so that a new sender can begin one; None if none may be ended.
+        """Id of the session to end in favour of a new sender's session; None if none may be ended.
 
         A host with many sessions cannot block others: for a host with fewer sessions, the oldest
-        session of the host with the most is ended.
+        session of the host with the most sessions is ended.
         """
         name, session = next(iter(self._sessions.items()), (None, None))
         if session is None or now_ns - session.heard_ns > IDLE_NS:

@@ -1,9 +1,9 @@
 """Outages of paths that were measured at the same time, and outages that they have in common.
 
-T is OUTAGE_S, or SPARSE times the typical time between two probes if that is longer. A path is out
-from the first of consecutive probes without an answer within T until the next probe with one, if
-these probes cover at least T. A probe covers the time until the next probe, but at most SPARSE
-typical times, because no probes are sent during a train.
+T is OUTAGE_S, or SPARSE times the typical time between two probes if that is longer. A probe fails
+without an answer within T. A path is out from the first of consecutive failed probes until the next
+answered probe, if the failed probes cover at least T. A probe covers the time until the next probe,
+but at most SPARSE typical times, because no probes are sent during a train.
 
     share_k = |out_k and covered| / |covered|        covered: by a probe of every path
     common  = |out_1 and out_2 and ... and covered| / |covered|

@@ -19,8 +19,8 @@ from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, 
 TEXT_CORRELATION_MIN = 0.5
 """Shortest correlation time that the text states, as a multiple of the time between packets."""
 ORDERED_SHARE = 0.01
-"""A path counts as ordered if no packet was reordered, but with independent delays more than this
-share would have been."""
+"""A path counts as ordered if no packet was reordered, although independent delays would reorder
+more than this share of the packets."""
 
 
 class ModelFigures(msgspec.Struct, frozen=True):
@@ -44,7 +44,7 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     burst_packets: float
     """Mean length of a run of lost packets [packets]."""
     reordered: float
-    """Share of packets that arrived after one sent later."""
+    """Share of packets that arrived after a packet that was sent later."""
     mean_s: float
     sd_s: float
     quantiles_s: dict[str, float]
@@ -63,7 +63,7 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     train_wait_s: float
     """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
     delay_models: list[ModelFigures]
-    """Models of the delay, without the transmission time at the rate, the best first."""
+    """Models of the delay without the transmission time at `rate`; the best model is first."""
     loss_models: list[ModelFigures]
     text: str
     """Text of the best models, for `network.uplink` or `network.downlink`."""
@@ -76,7 +76,7 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Address of the other end, or LOCAL=HOST:PORT, or names of the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
-    """Content of a log, "" for a measurement; round-trip times are halved for each direction."""
+    """Kind of times in a log, "" for a measurement; a direction has half of each round trip."""
     seconds: float
     bytes: int
     """UDP payload of a packet [B]; 0 if a log does not contain it."""
@@ -86,7 +86,7 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     offset_doubt_s: float
     """Largest error of the offset, and of one-way delays (opposite in both directions) [s]."""
     drift_ppm: float
-    """Drift of the listener's clock [10⁻⁶]; 0 if none is significant."""
+    """Drift of the listener's clock [10⁻⁶]; 0 if the drift is not significant."""
     drift_doubt_ppm: float
     round_trip_mean_s: float
     """Mean round-trip time [s], which is independent of the clocks' offset."""
@@ -126,7 +126,7 @@ def outcome(
     Args:
         listener: HOST:PORT of the other end, or the names of files.
         secure: whether packets were encrypted.
-        log: content of the log; empty for a measurement.
+        log: kind of times in the log; empty for a measurement.
 
     Raises:
         ValueError: too few packets arrived.
@@ -221,7 +221,7 @@ def trace(delays: Delays, within_s: tuple[float, float] | None = None) -> str:
 
     Args:
         within_s: beginning and end of the trace [s], by default the first and the last packet's
-            time; the packets next outside this interval are moved to its ends.
+            time; the nearest packet outside at each end is moved to that end.
     """
     lines, last = ["time_s,delay_s,lost"], -np.inf
     times_s, delays_s = delays.time_s, delays.delay_s

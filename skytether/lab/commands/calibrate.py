@@ -1,4 +1,4 @@
-"""`skytether calibrate`: search for the paper's unpublished parameters, or for optimal ones."""
+"""`skytether calibrate`: search for the paper's unpublished parameters, or optimal parameters."""
 
 import math
 from collections.abc import Sequence
@@ -61,7 +61,7 @@ def calibrate(argv: Sequence[str]) -> None:
     """Search for the values of some keys that reproduce the paper's Table 1, or minimise the error.
 
     Every point is flown in virtual time with the same seeds. OUT/best.toml is the best scenario,
-    and can be flown like any other. All flights are stored: after Ctrl-C or a crash, the same
+    and can be flown like any scenario. All flights are stored: after Ctrl-C or a crash, the same
     command continues the search.
     """
     options = command.parse(CalibrateOptions(), argv, "skytether calibrate", calibrate.__doc__)

@@ -61,11 +61,11 @@ class IdentifyOptions:
     """Scenario to be flown later: a name (`skytether list scenarios`) or a .toml file. The
     written scenario extends it."""
     speed: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
-    """Height of the velocity steps [m/s], one number for all axes or one for each axis. By default
+    """Size of the velocity steps [m/s], one number for all axes or one for each axis. By default
     the reference's largest speed on the axis, but at least half of its largest speed on any."""
     also: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
-    """Further heights of velocity steps to fly [m/s], to measure the errors of models that are
-    identified at other heights."""
+    """Further sizes of velocity steps to fly [m/s], to measure the errors of models that are
+    identified at other sizes."""
     hold: float | None = None
     """Time for which each velocity step is held [s]; by default four time constants of the
     scenario's model plus its dead time, within 3 to 6 s."""
@@ -137,7 +137,7 @@ def identify(argv: Sequence[str]) -> None:
 
 
 def _asked(options: IdentifyOptions) -> tuple[Scenario, list[ExperimentPlan]]:
-    """Scenario with the requested kind of vehicle, and one experiment for each size of step.
+    """Scenario with the requested kind of vehicle, and one experiment for each size of the steps.
 
     Raises CommandError or ConfigError if the request cannot be flown.
     """
@@ -156,7 +156,7 @@ def _asked(options: IdentifyOptions) -> tuple[Scenario, list[ExperimentPlan]]:
 
 
 def _size(scenario: Scenario, flag: str, given: Sequence[float]) -> tuple[float, ...]:
-    """Size of step on each axis [m/s]; raises CommandError if a size cannot be flown."""
+    """Size of the velocity steps on each axis [m/s]; raises CommandError if it cannot be flown."""
     axes = scenario.model.axes
     if len(given) not in (1, axes):
         raise CommandError(f"{flag}: got {len(given)} numbers, expected 1 or {axes}", 2)
@@ -304,7 +304,7 @@ def _show_models(flown: SizeFlown) -> None:
 
 
 def _costs(flown: Sequence[SizeFlown]) -> list[dict[str, float]]:
-    """Largest errors at the requested height of steps, of the models identified at each height."""
+    """Largest errors in steps of the requested size, of the models identified at each size."""
     measured = [axis.responses for axis in flown[0].axes]
 
     def off(model: Fit | None, axis: int) -> float:

@@ -93,9 +93,9 @@ class Crew:
     done: float = 0.0
     cpu_s: float = 0.0
     runs: int = 0
-    """Number of flights that this command has flown for sweeps, without stored ones."""
+    """Number of flights that this command has flown for sweeps; stored flights do not count."""
     fresh: list[Any] = field(default_factory=list)
-    """New results of this command, without stored ones."""
+    """Results that this command has computed; stored results are not included."""
 
     def advance(self, amount: float, text: str = "") -> None:
         self.done += amount
@@ -115,13 +115,13 @@ class Crew:
         """Fly the missing cells of a study; returns the results of all cells, in order.
 
         Args:
-            fly: flies a cell, and evaluates the flight; called in a worker.
+            fly: function that flies a cell and evaluates the flight; called in a worker.
             cells: the cells, by their keys in the journal.
             kind: type of a result, for decoding the journal; only needed with a folder.
             settings: all settings that determine the results, besides the cells.
             out: folder of the journal; None: results are not stored.
             size: amount of work of a cell, in the progress bar's unit.
-            tell: returns the text of the progress bar, from all results so far.
+            tell: function that returns the text of the progress bar from all results so far.
 
         Raises:
             CommandError: interrupted (with the results so far), or a worker has died.
@@ -220,8 +220,8 @@ class Crew:
 
 @contextmanager
 def crew(flags: Flags, title: str, total: float, unit: str = "runs") -> Iterator[Crew]:
-    """Workers with a progress bar on stderr, which counts up to `total`; Ctrl-C ends the workers in
-    order.
+    """Workers, and a progress bar on stderr that counts up to `total`; Ctrl-C stops the workers
+    cleanly.
     """
     if not flags.scheduler:  # Compile now: otherwise every worker would compile all kernels.
         loading.load_all()

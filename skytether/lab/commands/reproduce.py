@@ -53,7 +53,7 @@ def reproduce(argv: Sequence[str]) -> None:
     """Reproduce the paper's Table 1 and Figures 2 to 5, and fly further usual studies.
 
     OUT/report.html has all results, and opens offline; every figure is in OUT as PNG, PDF and CSV.
-    It shows flights over real UDP beside those in virtual time. Flights are stored: after Ctrl-C
+    The report shows flights over UDP beside those in virtual time. All are stored: after Ctrl-C
     or a crash, the same command continues; after the last flight, it only redraws the report.
     """
     options = read(ReproduceOptions(), argv, "skytether reproduce", reproduce.__doc__)
@@ -79,7 +79,7 @@ def reproduce(argv: Sequence[str]) -> None:
 def _measure(
     options: ReproduceOptions, scenario: Scenario, scale: ReproductionSize
 ) -> tuple[Reproduction, int]:
-    """Fly what is missing; returns all flights, and the number of flights flown by this call."""
+    """Fly the missing flights; returns all flights, and the number of flights of this call."""
     table = studies.table_study(scenario, scale)
     curves = studies.curve_studies(scenario, scale)
     maps, periods = studies.map_sweep(scenario, scale), studies.period_sweep(scenario, scale)

@@ -17,7 +17,7 @@ Cells = Sequence[Sequence[str]]
 def show(title: str, headings: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table: first column left-aligned, others right-aligned, no cell truncated.
 
-    On a narrow terminal it is split into several tables, one below the other. Without headings the
+    On a narrow terminal the table is split into several, one below the other. Without headings the
     table is a list of names and values.
     """
     cells = [
@@ -46,7 +46,7 @@ def fitted(
     """Split a table into tables no wider than `width`, if the width of its cells allows it.
 
     If values of the first column repeat, there is a table for each value, with the value in its
-    title. Tables still too wide are split by columns, and each part has the first column.
+    title. Tables that are still too wide are split by columns; each part has the first column.
     """
     widths = [AROUND + max(map(len, column)) for column in zip(headings, *rows, strict=True)]
     if not headings or len(headings) < 3 or 1 + sum(widths) <= width:

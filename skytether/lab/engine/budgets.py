@@ -68,7 +68,7 @@ class FlownContender:
 
     contender: Contender
     threshold: float | None
-    """Threshold of the trigger; None if the contender has none."""
+    """Threshold of the trigger; None for a contender without a threshold."""
     report: str
     """Reporting policy, a key of REPORTS, or ITS_OWN."""
     tuned: bool

@@ -1,7 +1,7 @@
 """Objectives of searches: to reproduce the paper's Table 1, or the smallest error within limits.
 
-An objective (`search.Objective`) flies every point of a search, which is a scenario, with the
-same seeds, and scores the flights. A smaller score is better.
+A point of a search is a scenario. An objective (`search.Objective`) flies every point with the same
+seeds, and scores the flights. A smaller score is better.
 """
 
 import math
@@ -36,10 +36,10 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
         "event_ratio": 0.1,
     },
 }
-"""Entries of the paper's Table 1 [m], and the event ratio for the paper's "10 times smaller"."""
+"""Entries of the paper's Table 1 [m], and event ratios; the paper says only "10 times smaller"."""
 
 TOLERANCE = 0.1
-"""Largest relative deviation of an entry that counts as reproduced; twice this for event ratios."""
+"""An entry counts as reproduced up to this relative deviation, an event ratio up to twice this."""
 UNFLYABLE = 1e9
 """Score of a point if one of its flights failed."""
 
@@ -112,7 +112,7 @@ WEIGHTS = (
     Free("control.input_weight", 1e-4, 1e4),
     Free("control.change_weight", 1e-4, 1e4),
 )
-"""Weights that a search varies; that of the position is fixed, because only ratios matter."""
+"""Weights that a search varies; the position's weight is fixed, because only ratios matter."""
 REGULATOR = (WEIGHTS[0], *WEIGHTS[3:])
 """Weights that a trajectory scheme uses: for planning, and for the regulator aboard."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)

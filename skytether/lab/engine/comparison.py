@@ -44,12 +44,12 @@ FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """Claim: one contender's RMSE xy is at most a given multiple of another's."""
+    """Claim: one contender's RMSE xy is at most a given multiple of another contender's."""
 
     ours: str
     theirs: str
     share: float = 1.0
-    """Largest allowed number of packets both ways, as a share of the other contender's."""
+    """Largest number of packets, both ways, as a share of the other contender's packets."""
     at_most: Mapping[str, float] = field(default_factory=dict)
     """Largest claimed ratio by case; in other cases the ratio is only reported."""
 

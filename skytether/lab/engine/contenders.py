@@ -499,7 +499,7 @@ def to_file(found: Sequence[TunedWeights], scale: ComparisonSize) -> str:
 
 
 def _keys_of(found: TunedWeights) -> dict[str, Any]:
-    """Keys of a result for the file: the contender's own, and those that differ from the plant."""
+    """Keys of a result for the file: the contender's own keys, and differences from the plant."""
     values = dict(flat(reading.to_table(found.scenario)))
     own = {f"control.{key}": values[f"control.{key}"] for key in found.contender.control}
     return own | differences(found.scenario, found.case.plant)

@@ -27,7 +27,7 @@ def students(freedom: int) -> float:
 def interval(values: Sequence[float]) -> Estimate:
     """Mean of some values, and half-width of its 95 % interval (Student's t).
 
-    The mean is None without values, the interval with fewer than two.
+    The mean is None without values, the interval with fewer than two values.
     """
     if not values:
         return None, None
@@ -40,7 +40,7 @@ def interval(values: Sequence[float]) -> Estimate:
 def jackknife(statistic: Callable[[Array], float], sample: Array) -> tuple[float, float]:
     """Statistic of a sample, and half-width of its 95 % interval (jackknife, Student's t).
 
-    `sample` has an independent row for each flight, at least two.
+    `sample` has a row for each flight, which is independent of the others, and at least two rows.
     """
     n = len(sample)
     others = np.array([statistic(np.delete(sample, row, axis=0)) for row in range(n)])

@@ -134,7 +134,7 @@ def digests(scenarios: Sequence[Scenario]) -> dict[str, str]:
 
 
 def entries_of(scenario: Scenario) -> Iterator[Entry]:
-    """Entries of scheme, planner, policies of the trigger, shape and vehicle."""
+    """Table entries of a scenario's scheme, planner, trigger policies, reference and vehicle."""
     control = scenario.control
     yield SCHEMES[schemes.call(control.scheme).name]
     yield PLANNERS[PLANNERS.one(control.planner).name]

@@ -46,13 +46,13 @@ PUSH = 1e-4
 above the rounding errors of messages with a noise of some centimetres.
 """
 FLOOR = 1e-9
-"""Share of the largest mean square below which a mean square counts as rounding error."""
+"""A mean square counts as rounding error below this share of the largest mean square."""
 SETTLE_S, ROUND_TRIPS = 5.0, 4.0
 """Time before a push: a time [s], plus a number of mean round trips. When the push begins, sessions
 are open, and the delay bound is stationary.
 """
 WIND_S, WIND_BUILDS_S = 60.0, 10.0
-"""Time for which the response to wind is evaluated, and the time before for its build-up [s]."""
+"""Time for which the response to wind is evaluated, and time before in which it builds up [s]."""
 SMALL = 0.05
 """A response is evaluated until an input reaches this share of its bound: so no bound is active."""
 STEPS_MIN = 10
@@ -62,7 +62,7 @@ WIND_ALONE = 0.1
 CLOCK_ONLY = ("always", "periodic", "silence", "budget")
 """Triggers that do not use the state."""
 RATE_RUNS, LIMIT_RUNS = 4, 4
-"""Number of seeds for measuring a trigger's rate, and largest number for a bisection."""
+"""Number of seeds for measuring a trigger's rate, and largest number of seeds for a bisection."""
 HALVINGS = 7
 
 
@@ -88,7 +88,7 @@ class Differing(NamedTuple):
     dead_time_s: float = 0.0
     """Dead time minus that of the model [s]."""
     delay_s: float = 0.0
-    """Delay added to the network's, each way [s]."""
+    """Delay added to the network's delay in each direction [s]."""
 
     def is_of(self, scenario: Scenario) -> bool:
         """Whether the vehicle can be simulated: its dead time must not be negative."""

@@ -108,7 +108,7 @@ class Optimiser:
         low, high = np.log([key.low for key in free]), np.log([key.high for key in free])
         self._low, self._range = low, high - low
         start_point = (np.log([key.of(plain(start)) for key in free]) - low) / self._range
-        # A generator of its own: other code may use numpy's global one.
+        # A separate random generator, because other code may use numpy's global generator.
         rng = np.random.default_rng(seed)
         options = {
             "bounds": [0, 1],

@@ -1,8 +1,8 @@
 """Studies of `skytether reproduce`: the paper's Table 1 and Fig. 5, and further usual studies.
 
-A study flies all methods over the values of one parameter. For a fair comparison, a second sweep
-flies periodic sending at each value, with the period nearest to the event trigger's rate in the
-first sweep.
+A study is a sweep of all methods over the values of one parameter. For a fair comparison, a second
+sweep flies periodic sending at each value, with the period nearest to the event trigger's rate in
+the first sweep.
 """
 
 import math
@@ -45,7 +45,7 @@ class ReproductionSize:
     cells: int
     """Number of cells along each side of Fig. 5."""
     periods: tuple[int, ...]
-    """Periods of periodic sending in Fig. 5 as curves [steps]."""
+    """Periods with which periodic sending is flown for the curves of Fig. 5 [steps]."""
     duration: float
     """Length of a flight in virtual time [s]."""
     real_s: float
@@ -130,7 +130,7 @@ def period(runs: Sequence[Summary]) -> int:
 
 
 def table_study(scenario: Scenario, scale: ReproductionSize) -> Study:
-    """Study of Table 1, and of flights as short as those over UDP, for comparison."""
+    """Study of Table 1, and for comparison a study of flights as short as those over UDP."""
     short = {"duration": scale.real_s, "settle": scale.real_settle_s}
     values = (scenario.duration, scale.real_s)
     axis = GridAxis("duration", values, ({}, short))

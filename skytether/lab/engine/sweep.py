@@ -1,8 +1,8 @@
 """Sweeps: many flights over a grid of scenarios, their summaries, and the tables of their means.
 
-A sweep is cells × runs. A cell is the scenario with one value from each grid; its runs differ only
-in the seed, which counts up from the scenario's. Runs are flown in chunks of a fixed size, so that
-no result depends on the number of workers, or on interruptions.
+A sweep has cells, and runs of each cell. A cell is the scenario with one value from each grid; its
+runs differ only in the seed, which counts up from the scenario's. Tasks have a fixed number of
+runs, so that no result depends on the number of workers, or on interruptions.
 """
 
 import itertools

@@ -5,8 +5,8 @@
 Gain g, time constant τ and dead time θ are the least-squares solution over all steps of an axis.
 The offset w, constant within a step, is due to wind or sensor error; subtracting each step's mean
 from both sides removes it. Residuals are correlated within a step, so the intervals treat steps as
-clusters (the sandwich estimator; Liang and Zeger, Biometrika 73, 1986). They are never narrower
-than those for white noise.
+clusters (the sandwich estimator; Liang and Zeger, Biometrika 73, 1986). The intervals are never
+narrower than those for white noise.
 """
 
 import math
@@ -43,7 +43,7 @@ class StepResponse(NamedTuple):
     """Changes of the input that affect the response: time relative to the step [s], and amount
     [m/s]; shape (n, 2)."""
     times: Array
-    """Times of the measurements relative to the step, some of them before it [s]; shape (m,)."""
+    """Times of the measurements relative to the step [s], negative before the step; shape (m,)."""
     velocity: Array
     """Measured velocity [m/s]; shape (m,)."""
 
@@ -70,11 +70,11 @@ class Misfit(NamedTuple):
 
     rms: float
     largest: float
-    """Largest difference in the mean over all starting steps, or over all ending steps."""
+    """Largest residual, averaged over all starting steps or over all ending steps."""
     at_s: float
-    """Time of the largest difference, relative to the step [s]."""
+    """Time of the largest residual, relative to the step [s]."""
     certain: float
-    """Lower confidence bound of the largest difference, from the scatter between steps."""
+    """Lower confidence bound of the largest residual, from the scatter between steps."""
 
 
 class Fit(NamedTuple):

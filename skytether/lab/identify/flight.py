@@ -1,7 +1,7 @@
 """Flight of an experiment: an endpoint that flies a vehicle without a server.
 
-The vehicle takes off, flies the experiment, and lands. Any event that prevents it from following a
-plan ends the flight at once; if a pilot takes over, the pilot keeps control of the vehicle.
+The vehicle takes off, flies the experiment, and lands. Any event that would prevent a vehicle from
+following a plan ends the flight at once; a pilot who takes over keeps control of the vehicle.
 """
 
 from typing import Any
@@ -89,7 +89,7 @@ class Identifying(Endpoint):
         self._attend()
 
     def _go_on(self, now_ns: int) -> None:
-        """Fly a step; before the first one, take off once the vehicle is ready."""
+        """Fly a step; before the first step, take off once the vehicle is ready."""
         if self._epoch_ns is None:
             if not (self._flies.is_ready and self._flies.take_off(now_ns=now_ns)):
                 self._next_ns = now_ns + self._dt_ns

@@ -65,8 +65,8 @@ def scenario_text(
 
     Args:
         flown: scenario that was flown.
-        extends: name or file of the scenario that it extends.
-        base: that scenario.
+        extends: name or file of the base scenario, which the result extends.
+        base: the base scenario.
         axes: results of each axis.
     """
     fits = [each.fit for each in axes if each.fit is not None]

@@ -28,7 +28,7 @@ HOMEWARD_S = 15.0
 """Longest time for the way home [s]; steady wind may keep a vehicle away."""
 HOLD_MIN_S, HOLD_MAX_S = 3.0, 6.0
 STEP_MPS = 0.5
-"""Height of the velocity steps if the reference is at rest [m/s]."""
+"""Size of the velocity steps if the reference is at rest [m/s]."""
 STEP_MIN_MPS = 0.05
 FAST = 1.3
 """Safety factor on the predicted distance of a step."""
@@ -61,7 +61,7 @@ def reference_speeds(scenario: Scenario) -> list[float]:
 
 
 def default_speeds(scenario: Scenario) -> tuple[float, ...]:
-    """Default height of the velocity steps on each axis [m/s], similar to speeds of later flights.
+    """Default size of the velocity steps on each axis [m/s], similar to speeds of later flights.
 
     It is the reference's largest speed on the axis, but at least half of its largest speed on any
     axis: on an axis without motion, feedback still causes inputs.
@@ -171,7 +171,7 @@ class Experiment:
         return [min(max(HOMEWARD * (h - p), -most), most) for (p, _), h, most in axes]
 
     def _direction(self, axis: int) -> float:
-        """Direction in which the fence leaves space for a step; 0 if there is none.
+        """Direction in which the fence leaves space for a step: 1 or -1; 0 without such space.
 
         Up is tried first, and down only if the fence has a lower bound.
         """

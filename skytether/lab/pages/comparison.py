@@ -254,7 +254,7 @@ def weights_table(results: Sequence[ComparedCase]) -> Table:
 
 
 def _weights(value: Any) -> str:
-    """Text of a weight, or of several with commas; empty for None."""
+    """Text of a weight, or of several weights with commas; empty for None."""
     parts = () if value is None else np.atleast_1d(value)
     return ", ".join(f"{part:.4g}" for part in parts)
 
