@@ -55,9 +55,9 @@ def explain_flight(argv: Sequence[str]) -> None:
     """Fly a scenario in virtual time, and explain why something went wrong.
 
     The flight is repeated without some of its outages, lost and late packets, wind and noise, to
-    find the smallest set of them with which the same happens. Further flights show whether each is
-    needed, whether one more delivered packet would have averted it, how long an outage must be, and
-    what other keys would change, over the same network and, with --seeds, with other seeds.
+    find the smallest set of them with which the flight still goes wrong. Further flights show
+    whether each is needed, whether one more delivered packet would have averted the problem, how
+    long an outage must be, and what other keys would change, with --seeds also for other seeds.
 
     A recorded flight over UDP is replaced by its double, which flies in virtual time. Ctrl-C prints
     the explanation so far.
@@ -121,7 +121,7 @@ def _judge(options: ExplainOptions, recorded: Recorded) -> None:
 
 
 def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str | Track]:
-    """Scenario's name and case of a recorded flight, and its hash; of a double the recorded track.
+    """Scenario name, case, and hash of a recorded flight; over UDP its track in place of the hash.
 
     Raises:
         CommandError: the flight cannot be flown again.

@@ -43,7 +43,7 @@ if TYPE_CHECKING:  # the module needs the library of MCAP
     from skytether.view.recordings.recorded import Recorded
 
 NEAR_M = 0.1
-"""Largest distance of a double from its recording before the moment; else it is refused [m]."""
+"""A double is refused if its distance from the recording exceeds this before the moment [m]."""
 NOWHERE = 2**16 - 1
 """Number for the path of packets that the server exchanged with others than the client."""
 SENT = Happened.SENT
@@ -77,7 +77,7 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
     scenario, dt_ns, rows = recorded.scenario, recorded.scenario.dt_ns, recorded.parts["client"]
     client, server = ends = _ends(recorded)
     began_ns = _began_ns(recorded, client)
-    # The flight's time 0, up to a step before the recording's: so ticks are due at recorded ticks.
+    # The flight's time 0 is up to a step before the recording's, so that ticks are due as recorded.
     tick_ns = int(_of(server, Happened.WOKEN)["due_ns"][-1])
     zero_ns = recorded.begin_ns - (recorded.begin_ns - tick_ns - MIDNIGHT_NS) % dt_ns
     compute_ns = _compute_ns(server)
@@ -102,7 +102,7 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
         gone = (changes for name, changes in SETTINGS if name != COMPUTING)
         keys |= dict(chain.from_iterable(gone))
         keys["vehicle.kind"] = DOUBLED
-    # The vehicle's port is due 1 ns before step 0 and woken 1 ns late: then it is in the air.
+    # The vehicle's port is due 1 ns before step 0, and woken 1 ns late: then the vehicle is up.
     late_ns[0][began_ns - zero_ns - 1] = 1
     opens_s, (states, inputs) = (opens_ns[0] - zero_ns) / SECOND_NS, _steps(rows)
     sends = bool((client["due_ns"][_causes(client)[client["happened"] == SENT]] == began_ns).any())
@@ -169,7 +169,7 @@ def _of(rows: Rows, happened: Happened) -> Rows:
 
 
 def _began_ns(recorded: "Recorded", client: Rows) -> int:
-    """Time of step 0 [ns]: the wake near `Flying` that most wakes follow by a multiple of dt."""
+    """Time of step 0 [ns]: the wake near `Flying` from which most wakes are whole steps away."""
     times_ns = (at_ns for at_ns, _, event in recorded.events() if isinstance(event, Flying))
     flying_ns, dt_ns = recorded.begin_ns + next(times_ns, 0), recorded.scenario.dt_ns
     due_ns = _of(client, Happened.WOKEN)["due_ns"]
@@ -275,7 +275,7 @@ def _with_fates(scenario: Scenario, fates: Sequence[File], keys: Mapping[str, An
 
 
 def _steps(client: Rows) -> tuple[Array, Array]:
-    """States and inputs of all steps; a missed step has an interpolated state, the last input."""
+    """States and inputs of all steps; missed steps have interpolated states, and the last input."""
     step, states = client["step"], client["state"]
     steps = np.arange(int(step[-1]) + 1)
     columns = [np.interp(steps, step, each) for each in states.reshape(len(states), -1).T]

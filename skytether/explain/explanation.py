@@ -53,8 +53,8 @@ class Explanation:
         return f"{said}\n\n{of_mission}" if (of_mission := self.flown.judgement) else said
 
     def to_json(self, following: str = "") -> bytes:
-        """The explanation so far as JSON: its fields except the flights, a mission's judgement, the
-        text, and as `next` the name of the next step, empty at the end.
+        """The explanation so far as JSON: its fields without flights. Further fields are a
+        mission's judgement, the text, and `next`: name of the next step, empty at the end.
         """
         names = "name", "seed", "moments", "moment", "nearness", "cause", "rescues", "remedies"
         fields = {name: getattr(self, name) for name in names}

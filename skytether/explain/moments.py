@@ -39,7 +39,7 @@ PAUSE_S = 1.0
 NEAR = 1.05
 """Two vehicles are too near below this multiple of the required separation."""
 WASTED_TIMES, WASTED_PER_S = 3.0, 10.0
-"""Plans are wasted above this multiple of the perfect flight's rate, and this excess [1/s]."""
+"""Plans are wasted if their rate exceeds the perfect flight's by this factor and excess [1/s]."""
 
 ALIVE = 0.5
 """A path was not dead if a larger share of its packets arrived."""

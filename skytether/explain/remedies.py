@@ -1,8 +1,8 @@
 """Remedies: the same flight with other keys over the same network, and flights of other seeds.
 
-The keys depend on the cause. For the network they set what is sent, how often and over which paths,
-the time-outs and the horizon; for wind, sensors or the model, the estimate, the filter or the
-model. A remedy may cost packets, or avert a brake but increase the error: both are shown.
+The keys depend on the cause: for the network, what is sent, how often and over which paths, the
+time-outs and the horizon; for wind, sensors or the model, the observer, the filter or the model. A
+remedy may cost packets, or avert a brake but increase the error, so packets and error are shown.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,8 +1,8 @@
 """Units that can be removed from a flight to find a cause; flights with or without some of them.
 
 The fate of a packet is known for every millisecond of each lane, whether or not a packet was sent,
-so outages without packets are found, too. Shorter than OUTAGE_MS, each lost or late packet is a
-unit.
+so outages without packets are found, too. In stretches shorter than OUTAGE_MS, each lost or late
+packet is a unit.
 """
 
 from collections.abc import Collection, Iterator, Sequence

@@ -50,8 +50,8 @@ class Decided(Trigger):
 
     Args:
         vehicle: number of the vehicle in each row; shape (capacity,).
-        thresholds: threshold of `expected_gap` by vehicle; if infinite, no plan is sent; if below
-            0, every plan.
+        thresholds: threshold of `expected_gap` by vehicle; with an infinite threshold no plan is
+            sent, with one below 0 every plan.
     """
 
     doubts = True

@@ -211,7 +211,7 @@ class _Far:
         return Chunk(rows, first, thought_ns)
 
     def thought_ns(self, *, is_nothing: bool) -> int:
-        """Measured or drawn thinking time of an answer [ns]; nothing is drawn for no answer: 0."""
+        """Thinking time of an answer [ns], measured or drawn; a drawn time is 0 without answer."""
         if self.thinking is None:
             return self._clock_ns() - self._returned_ns
         if is_nothing:

@@ -195,7 +195,7 @@ def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
     if not isinstance(server, Endpoint):
         raise TypeError(f"server: got {server!r}, expected an Endpoint")
     if udp:
-        raise ConfigError("udp: got True with a server of your own, which flies in virtual time")
+        raise ConfigError("udp: got True with a server of your own, expected virtual time")
     if secure:
         message = "got True with a server of your own, which cannot open encrypted packets"
         raise ConfigError(f"secure: {message}")

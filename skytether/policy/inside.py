@@ -188,8 +188,8 @@ class Robot:
 
     Args:
         server: HOST:PORT of `skytether policy serve`, or of `serve`.
-        actions: type of the actions; without a row the robot holds: "absolute" repeats the last
-            row, "delta" has zeros.
+        actions: type of the actions. If no row remains, the robot executes the last row again
+            ("absolute"), or zeros ("delta").
         deadline: longest time from a call to its answer, except for the first call [s].
         step: length of a control step [s]; None: measured between the calls.
         rows: number of rows that the program executes of each answer.

@@ -53,7 +53,7 @@ class Schedule:
         actions: see `Actions`.
         key: key of the actions in the policy's reply.
         step_ns: length of a control step [ns].
-        rows: number of rows that the program executes of each answer; None: the clock decides.
+        rows: number of rows that the program executes of each answer; None: the clock counts rows.
         late_ns: longest allowed delay of a row after its planned time [ns].
         began_ns: time of step 0 [ns].
     """

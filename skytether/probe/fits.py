@@ -186,9 +186,9 @@ def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
     """Fit models of losses; the best is first; empty if nothing or everything was lost.
 
     The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and
-    loses every packet while it is bad. With probability exp(-Δt / cell) it is not redrawn between
-    two packets at a distance Δt; `cell` is the mean time from one redraw to the next. A bad period
-    lasts cell / (1 - share) on average.
+    loses every packet while it is bad. With probability exp(-Δt / cell) the channel is not redrawn
+    between two packets, a time Δt apart; `cell` is the mean time from one redraw to the next. A bad
+    period lasts cell / (1 - share) on average.
 
     Args:
         time_s: times of sending, in the order of sending; shape (n,).

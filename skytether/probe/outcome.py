@@ -76,7 +76,7 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Address of the other end, or LOCAL=HOST:PORT, or names of the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
-    """Kind of times in a log, "" for a measurement; a direction has half of each round trip."""
+    """Kind of times in a log; "" for a measurement. Each direction gets half of a round trip."""
     seconds: float
     bytes: int
     """UDP payload of a packet [B]; 0 if a log does not contain it."""

@@ -95,7 +95,7 @@ def test_every_case_has_weights_that_were_searched_for_or_those_of_one_that_has(
 def test_a_case_may_be_named() -> None:
     assert contenders.cases([]) == CASES
     assert [case.name for case in contenders.cases(["gusts", "target"])] == ["gusts", "target"]
-    with pytest.raises(ConfigError, match="--cases: got 'gust', expected others; did you mean"):
+    with pytest.raises(ConfigError, match="--cases: got 'gust', expected a case; did you mean"):
         contenders.cases(["gust"])
 
 

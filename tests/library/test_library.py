@@ -426,7 +426,7 @@ REFUSALS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: fly("demo", udp=True, server=mine()),
         ConfigError,
-        "udp: got True with a server of your own, which flies in virtual time",
+        "udp: got True with a server of your own, expected virtual time",
     ),
     (
         lambda: fly("demo", secure=True, server=mine()),

@@ -120,9 +120,9 @@ def identify(argv: Sequence[str]) -> None:
     scenario, plans = _asked(options)
     flies = vehicles.make(scenario, NUMBER)
     if len(plans) > 1 and flies.port:
-        raise CommandError("--also: got a vehicle with hardware, expected a simulated one", 2)
+        raise CommandError("--also: got a vehicle with hardware, expected a simulated vehicle", 2)
     if options.set_parameters and not flies.set_parameters():
-        kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
+        kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected a kind with parameters"
         raise CommandError(f"--set-parameters: {kind}", command.CONFIGURATION)
     figures.check(options.out / PICTURE)
     command.claim_folder("--out", options.out, SCENARIO, PICTURE, MEASURED, OUTCOME)
@@ -132,7 +132,7 @@ def identify(argv: Sequence[str]) -> None:
     _tell(options, scenario, flown)
     if why := flown[0].flight.why:
         code = command.INTERRUPTED if why == "interrupted" else command.RUN
-        raise CommandError(f"ended early: {why}; the measurements are in {options.out}", code)
+        raise CommandError(f"the flight ended early: {why}; measurements in {options.out}", code)
     _write_scenario(options, scenario, flown[0])
 
 
@@ -181,7 +181,7 @@ def _fly(scenario: Scenario, plan: ExperimentPlan, *, sets: bool) -> SizeFlown:
     """
     flies = vehicles.make(scenario, NUMBER)
     if sets and not flies.set_parameters():
-        kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected one with parameters"
+        kind = f"got vehicle.kind = {scenario.vehicle.kind!r}, expected a kind with parameters"
         raise CommandError(f"--set-parameters: {kind}", 2)
     within = fenced(scenario, plan)
     if within is not scenario:

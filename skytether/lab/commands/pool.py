@@ -314,7 +314,7 @@ def _cluster(address: str) -> Iterator[Executor]:
         try:
             theirs = client.run(metadata.version, "skytether")
         except ModuleNotFoundError as error:
-            raise CommandError(f"--scheduler: {address}: its workers have no skytether") from error
+            raise CommandError(f"--scheduler: {address}: its workers lack skytether") from error
         for worker, version in theirs.items():
             if version != ours:
                 other = f"{worker} has skytether {version}, expected {ours}"

@@ -36,7 +36,7 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
         "event_ratio": 0.1,
     },
 }
-"""Entries of the paper's Table 1 [m], and event ratios; the paper says only "10 times smaller"."""
+"""Entries of the paper's Table 1 [m]; the event ratio stands for the paper's "10 times smaller"."""
 
 TOLERANCE = 0.1
 """An entry counts as reproduced up to this relative deviation, an event ratio up to twice this."""

@@ -179,7 +179,7 @@ class Judged:
 
     @property
     def holds(self) -> bool | None:
-        """Whether the whole interval is within the claim, and the packets too; None if no claim."""
+        """Whether interval and packets are within the claim; None without a claimed ratio."""
         if self.at_most is None:
             return None
         return self.sparse and self.ratio is not None and self.ratio[2] <= self.at_most

@@ -202,13 +202,13 @@ def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -
 
 
 def _network(argument: str, value: Any) -> Mapping[str, Any]:
-    """Keys that set an argument of both directions' impairments; with "", all their impairments."""
+    """Keys that set an argument in both directions of the network; with "", all impairments."""
     at = f".{argument}" if argument else ""
     return {f"network.{way}{at}": value for way in ("uplink", "downlink")}
 
 
 def _noise(position_m: float) -> Mapping[str, Any]:
-    """Keys of the sensor's noise; the velocity's noise is 2.5/s times the position's [m]."""
+    """Keys of the sensor's noise; the velocity's noise [m/s] is 2.5 times the position's [m]."""
     return {
         "sensor.position_noise_m": position_m,
         "sensor.velocity_noise_mps": 2.5 * position_m,
@@ -271,7 +271,7 @@ def cases(names: Sequence[str]) -> Sequence[Case]:
     by_name = {case.name: case for case in CASES}
     for name in names:
         if name not in by_name:
-            raise ConfigError(f"--cases: got {name!r}, expected others; {hint(name, by_name)}")
+            raise ConfigError(f"--cases: got {name!r}, expected a case; {hint(name, by_name)}")
     return [by_name[name] for name in names] or CASES
 
 

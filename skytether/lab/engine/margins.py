@@ -151,7 +151,7 @@ class Margin(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MarginLimit(msgspec.Struct, frozen=True, kw_only=True):
-    """Largest value of a quantity for which the loop is stable; other quantities keep theirs."""
+    """Largest value of a quantity for which the loop is stable; other quantities do not change."""
 
     quantity: str
     """Name of the quantity in a table."""

@@ -121,7 +121,7 @@ class Optimiser:
         self._points: list[Any] = []
 
     def ask(self) -> list[Scenario]:
-        """Scenarios of the next generation; the first generation begins with the search's start."""
+        """Scenarios of the next generation; the first scenario of a search is its start."""
         first = self._search.countiter == 0
         self._points = self._search.ask()
         if first:
