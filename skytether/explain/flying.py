@@ -77,7 +77,7 @@ class Death(NamedTuple):
     vehicle: int
     path: int
     direction: int
-    """Direction in which the deciding end sends: UPLINK: the server; DOWNLINK: the vehicle."""
+    """Direction of the dead path: UPLINK if the server decided, DOWNLINK if the vehicle did."""
     arrived: float
     """Share of the packets sent over the path shortly before the decision that arrived."""
 
