@@ -1,8 +1,8 @@
 """Motions of vehicles on a mission: position of a vehicle at every time.
 
-A motion has knots SPACING steps apart, at multiples of SPACING of the vehicle's own steps, with
-constant acceleration between them, and rests from the last one on. It is sent as a trajectory with
-the same knots (`shared.law.spline`): the cubic between two of them equals the motion.
+A motion has a knot at every SPACING-th step of the vehicle. The acceleration is constant between
+two knots, and the vehicle rests from the last knot on. A motion is sent as a trajectory with the
+same knots (`shared.law.spline`): the cubic between two knots equals the motion.
 """
 
 from typing import Annotated, NamedTuple
@@ -24,7 +24,7 @@ MARGIN_M = 0.03
 
 
 Knots = Annotated[Array, 2]
-"""Values at the knots; shape (knots, axes). The 2 is the number of dimensions, for kernels."""
+"""Values at the knots; shape (knots, axes). The 2 tells kernels the number of dimensions."""
 
 
 def speed_bounds(u_max: Array, gain: Array, speed_mps: float) -> Array:
@@ -36,7 +36,7 @@ def speed_bounds(u_max: Array, gain: Array, speed_mps: float) -> Array:
         speed_mps: largest speed over all axes [m/s]; 0: limited by the input bound only.
     """
     most: Array = INPUT_SHARE * u_max * gain
-    # Bounds per axis keep constraints linear; exact on the diagonal, stricter along an axis.
+    # One bound per axis keeps constraints linear, but allows `speed_mps` only on the diagonal.
     return np.minimum(most, speed_mps / np.sqrt(len(most))) if speed_mps else most
 
 
@@ -55,9 +55,9 @@ class Motion(NamedTuple):
         return self.first + (len(self.position) - 1) * SPACING
 
     def at(self, steps: Array, dt_s: float) -> tuple[Array, Array]:
-        """Positions [m] and velocities [m/s] at steps, which may be fractional.
+        """Positions [m] and velocities [m/s] at given steps, which may be fractional.
 
-        Before its first knot a motion is at rest at this knot.
+        Before the first knot, the values are those of the first knot.
 
         Args:
             steps: shape (n,).
@@ -86,12 +86,12 @@ class Clearances(NamedTuple):
     tube_m: float
     """Distance of motions from zones: the largest distance of a vehicle from its motion."""
     bend_m: float
-    """Largest distance of a motion from its straight pieces, SAMPLES per interval."""
+    """Largest distance of a motion from the straight pieces that approximate it, see SAMPLES."""
 
     @property
     def margin_m(self) -> float:
-        """Margin of a plan in addition to the other clearances, for unchecked times between checked
-        ones, and for the solver's tolerance [m].
+        """Distance that a plan keeps in addition to the other clearances [m]. It covers the times
+        between the checked times, and the solver's tolerance.
         """
         return max(MARGIN_M, 2.0 * self.bend_m + 0.02)
 

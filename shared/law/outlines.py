@@ -1,6 +1,6 @@
 """Outlines of zones, and a test whether a straight line comes too near to a zone.
 
-Plain arithmetic on numbers, which the server compiles, because it checks all pieces of all motions.
+The server compiles the test, because it tests every straight piece of every motion.
 """
 
 from typing import Annotated, NamedTuple
@@ -9,7 +9,7 @@ from skytether.shared.law.model import Array
 
 
 class Outlines(NamedTuple):
-    """Polygons between two heights, in arrays."""
+    """Outlines of zones as arrays: polygons, each between a lowest and a highest height."""
 
     edges: Annotated[Array, 3]
     """Start and end of each edge, x and y [m]; shape (zones, edges, 4)."""
@@ -37,7 +37,7 @@ def is_near(
     Args:
         zone: index of the zone.
         x0, y0, x1, y1: both ends of the line [m].
-        low_m, high_m: least and largest height of the line.
+        low_m, high_m: least and largest height of the line [m].
         clearance_m: distance to keep [m].
     """
     box, is_fence = outlines.boxes[zone], outlines.fences[zone] > 0.0
@@ -47,7 +47,7 @@ def is_near(
         if min(low_m - box[4], box[5] - high_m) < clearance_m:
             return True
     else:
-        # Above or below the zone, the distance in the plane may be smaller.
+        # A line above or below the zone needs less distance in the plane.
         if off_m > 0.0:
             clearance2 -= off_m * off_m
         beside_x = max(box[0] - max(x0, x1), min(x0, x1) - box[1], 0.0)
@@ -91,15 +91,15 @@ def _crosses(
 
 
 def _is_left(x: float, y: float, x0: float, y0: float, x1: float, y1: float) -> bool:
-    """Whether an edge passes to the right of a point. A point is inside a polygon if an odd number
-    of its edges do.
+    """Whether a polygon's edge passes to the right of a point. If an odd number of edges do, the
+    point is inside the polygon.
 
     Args:
         x, y: the point [m].
         x0, y0, x1, y1: both ends of the edge [m].
     """
-    # Coordinates are compared without a subtraction, which rounds: two edges that meet must agree
-    # on the side of their common end on which the point is.
+    # Coordinates are compared, not subtracted: rounding must not make two edges disagree on which
+    # side of their common corner the point is.
     if (y0 > y) == (y1 > y):
         return False
     return x < x0 + (y - y0) / (y1 - y0) * (x1 - x0)

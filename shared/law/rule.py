@@ -4,22 +4,21 @@
                                                             n: number of its inputs
                                                             k - k_h: the present stage
 
-No input is flown later than `link.age_max_s` after the observation that it was planned from: a
-longer horizon ends there. After the last input the vehicle repeats this input for ever, or brakes
-from it. Without compensation the vehicle flies the first input at all stages of the horizon.
+Inputs are flown until `link.age_max_s` after the observation from which they were planned, even if
+the horizon is longer. After the last input the vehicle repeats this input for ever, or brakes from
+this input. Without compensation the vehicle flies the first input at all stages of the horizon.
 
 With feedback aboard the vehicle is controlled towards the reference state x̄ of these inputs, also
 after the last one:
 
     u*(k) = u(k) + K (x̄(k) - x(k)),     x̄(i+1) = A x̄(i) + B (u(i) + ŵ)
 
-ŵ is the disturbance that the inputs compensate. Once braking has ended it is omitted, so that x̄
-comes to rest, where the vehicle stays in any wind.
+ŵ is the disturbance that the inputs compensate. Once braking has ended, ŵ is omitted, so that x̄
+comes to rest; the feedback then holds the vehicle at x̄ in any wind.
 
 This is the only implementation of the rule: `step` and `reference_at` combine its parts for one
-spatial axis, `fly_horizon` for all axes of a vehicle. The client flies by it; the server's replay
-compiles the same functions into its kernels, and so computes the flown input. Only `speed` depends
-on all axes.
+spatial axis, `fly_horizon` for all axes of a vehicle. The client calls these functions, and the
+server's replay compiles them, so both compute the same input. Only `speed` depends on all axes.
 """
 
 from collections.abc import Sequence
@@ -50,7 +49,7 @@ class AxisHorizon(NamedTuple):
 
 
 def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
-    """Number of a horizon's inputs that may be flown; none if it is less than 1.
+    """Number of a horizon's inputs that may be flown; 0 or a negative number: none.
 
     Args:
         length: number of the horizon's inputs.
@@ -106,8 +105,8 @@ def remaining(stage: int, length: int, speed: float, brake: float) -> float:
 
 
 def reference_input(without_feedback: float, disturbance: float, share: float) -> float:
-    """Input that drives the reference state x̄ [m/s]: with the disturbance ŵ, or 0 once braking has
-    ended (`share` is 0).
+    """Input that drives the reference state x̄ [m/s]: `without_feedback` plus the disturbance ŵ, or
+    0 once braking has ended (`share` is 0).
     """
     # With ŵ, x̄ would drift without end after the vehicle has braked.
     return without_feedback + disturbance if share > 0.0 else 0.0
@@ -127,9 +126,9 @@ def flown(stage: int, without_feedback: float, back: float, bound: float) -> flo
     """Input that is flown at a stage of a horizon [m/s].
 
     Args:
-        stage: present stage; before the first input there is no x̄.
+        stage: present stage; if negative, `back` is ignored.
         without_feedback: `remaining` times the input at `entry` [m/s].
-        back: `feedback`, or 0 without it [m/s].
+        back: result of `feedback`; 0 without feedback aboard [m/s].
         bound: u_max [m/s].
     """
     # There is no x̄ before stage 0, the step that the horizon was made for.
@@ -184,7 +183,7 @@ def step(
         p, v: state at the stage, position [m] and velocity [m/s].
 
     Returns:
-        the input that is flown, u*(k) [m/s]; the same without feedback [m/s]; and, with
+        the input that is flown, u*(k) [m/s]; this input without feedback [m/s]; and, with
             feedback, x̄ at the next stage, position [m] and velocity [m/s].
 
     Source: eq. (11).
@@ -235,12 +234,12 @@ def fly_horizon(
     Args:
         table: the horizon without its inputs, one row per axis, see `horizon_of`.
         inputs: inputs of the horizon [m/s]; shape (axes, n).
-        reference: x̄ at the stage `first` [m, m/s]; with feedback it is advanced to a later
-            `stage`; shape (axes, 2).
+        reference: x̄ at the stage `first` [m, m/s], with feedback replaced by x̄ at `stage`; shape
+            (axes, 2).
         first: stage of the given x̄.
         stage: k - k_h.
         state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-        flown: output: the inputs flown, and the same without feedback [m/s]; shape (2, axes).
+        flown: output: row 0 the inputs flown, row 1 without feedback [m/s]; shape (2, axes).
     """
     for axis in range(len(table)):
         horizon = horizon_of(table, inputs, axis)
@@ -258,7 +257,7 @@ def fly_horizon(
 def foresee_horizon(
     table: Table, inputs: Table, reference: Table, stage: int, state: Table, ahead: Table
 ) -> None:
-    """State of each axis one step later, flown with the horizon from a state at the stage.
+    """State of each axis one step later, if the vehicle flies the horizon from a given state.
 
     Args:
         table, inputs, stage, state: see `fly_horizon`.

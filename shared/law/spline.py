@@ -5,8 +5,8 @@ knots, a time T apart, it is the cubic Hermite polynomial, with s from 0 to 1,
 
     p̄(s) = (1 + 2 s) (1 - s)² p₀ + s (1 - s)² T v₀ + s² (3 - 2 s) p₁ - s² (1 - s) T v₁
 
-and v̄ its derivative. Before the first knot and after the last it continues straight: a single knot
-is a state that moves on at its velocity, p̄ = p₀ + t v₀. Stages count steps from the first knot.
+and v̄ is its derivative. Before the first knot and after the last the spline is straight: a single
+knot means motion at constant velocity, p̄ = p₀ + t v₀. Stages count steps from the first knot.
 
 The vehicle flies, at each stage i,
 
@@ -15,11 +15,10 @@ The vehicle flies, at each stage i,
 ū is the input under which the velocity of eq. (4) follows the spline, K and λ the vehicle's
 regulator (`shared.scenario.gain`), u(i-1) the input flown until now, and ŵ the disturbance
 estimated by the vehicle's own filter. x is the state in which the input takes effect
-(`shared.law.dead_time`), so the spline is the desired trajectory shifted by the dead time. No input
-is flown for longer than `link.age_max_s` after the observation from which it was planned: from then
-on ū is held, or braked as in `shared.law.rule`, and x̄ follows eq. (4) with this ū until it rests.
-
-The client flies by these functions, and the server compiles them.
+(`shared.law.dead_time`), so the spline is the desired trajectory shifted by the dead time. From
+`link.age_max_s` after the observation on which the plan is based, ū brakes as in `shared.law.rule`,
+and x̄ follows eq. (4) with this ū until x̄ rests; without braking, the spline is flown for ever.
+The client calls these functions, and the server compiles them.
 """
 
 from collections.abc import Sequence
@@ -67,7 +66,7 @@ def spline_at(knots: Knots, spacing: int, dt_s: float, stage: int) -> tuple[floa
         dt_s: length of a step [s].
         stage: steps since the first knot; negative before it.
     """
-    # Knots are a flat row of positions and velocities, which numba and Python index equally.
+    # Knots are a flat row, because numba and Python index a flat row in the same way.
     last = len(knots) // 2 - 1
     knot = stage // spacing
     if knot < 0 or knot >= last:
@@ -88,13 +87,13 @@ def along(model: Axis, knots: Knots, spacing: int, dt_s: float, stage: int) -> f
     """Input ū under which the velocity of eq. (4) follows a spline at a stage [m/s]."""
     _, v = spline_at(knots, spacing, dt_s, stage)
     _, ahead = spline_at(knots, spacing, dt_s, stage + 1)
-    # Second row of eq. (4), solved for u: the velocity is met exactly at each step, and the
-    # position up to the curvature within a step.
+    # Second row of eq. (4), solved for u. At each step the velocity is exact; the position has a
+    # small error, because the spline bends within a step.
     return (ahead - model.a11 * v) / model.b1
 
 
 def guided(guide: AxisSpline, stage: int) -> float:
-    """Input ū at a stage [m/s]."""
+    """Input ū at a stage, along the spline or braking [m/s]."""
     if stage < guide.length or guide.brake == 0.0:
         u_spline = along(guide.model, guide.knots, guide.spacing, guide.dt_s, stage)
         return bounded(u_spline, guide.bound)
@@ -108,7 +107,7 @@ def guided_to(
     """State x̄ at the stage `last`, position [m] and velocity [m/s].
 
     Args:
-        first: stage of the given x̄; only used after the last stage that may be flown.
+        first: stage of the given x̄, which is used only after the last stage that may be flown.
         last: stage of the result.
         ref_p, ref_v: x̄ at `first`, position [m] and velocity [m/s].
     """
@@ -205,14 +204,14 @@ def fly_spline(
 
     Args:
         table: the spline without its knots, one row per axis, see `spline_of`.
-        knots: shape (axes, 2 n).
-        reference: x̄ at the stage `first` [m, m/s], replaced by that at `stage`; shape (axes, 2).
+        knots: position [m] and velocity [m/s] of each knot in turn; shape (axes, 2 n).
+        reference: x̄ at the stage `first` [m, m/s], replaced by x̄ at `stage`; shape (axes, 2).
         first: stage of the given x̄.
         stage: steps since the first knot.
         state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
         disturbance: ŵ of each axis [m/s].
         before: input flown until now, of each axis [m/s].
-        flown: output: the inputs flown, and ū [m/s]; shape (2, axes).
+        flown: output: row 0 the inputs flown, row 1 ū [m/s]; shape (2, axes).
     """
     for axis in range(len(table)):
         guide = spline_of(table, knots, axis)
@@ -227,7 +226,7 @@ def fly_spline(
 def foresee_spline(
     table: Table, knots: Table, reference: Table, stage: int, state: Table, ahead: Table
 ) -> None:
-    """State of each axis one step later, flown along the spline from a state at the stage.
+    """State of each axis one step later, if the vehicle follows the spline from a given state.
 
     The share λ of the previous input is omitted, because its effect lasts only a few steps. Wind is
     assumed to be compensated.

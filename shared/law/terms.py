@@ -1,8 +1,8 @@
 """Terms of a flight: the values on which server and client must agree before it.
 
-All values that both ends use for prediction are terms, and both ends compute predictions only from
-terms, so that no other value can be used. Keys of a scenario that are not terms belong to one end,
-which may set them freely; `shared/scenario/schema.py` names the owner of each.
+Server and client compute predictions from terms only, so that both predict the same. A key of a
+scenario that is not a term belongs to one end, which may set it freely;
+`shared/scenario/schema.py` names the owner of each key.
 """
 
 from typing import NamedTuple
@@ -49,12 +49,12 @@ class Terms(NamedTuple):
     exhausted: str
     """Behaviour after a horizon's last input: "hold" or "brake"."""
     brake_mps2: float
-    """Deceleration with which braking takes the desired velocity to zero [m/s²]."""
+    """Deceleration of the desired velocity when braking [m/s²]."""
     age_max_s: float
     join_s: float
-    """Time after a trajectory's first knot up to which it is accepted [s]; 0: at any time."""
+    """Time after its first knot for which a trajectory is still accepted [s]; 0: any time."""
     land_after_s: float
-    """Time of hovering with a silent server after which the vehicle lands [s]; 0: never."""
+    """Time of hovering without packets of the server until the vehicle lands [s]; 0: never."""
     shape: str
     radius_m: float
     """Half the width of circle, figure-eight and square [m]."""
@@ -69,10 +69,10 @@ class Terms(NamedTuple):
     table: str
     """Digest of the content of the trajectory's CSV file."""
     separation_m: float = 0.5
-    """Distance between vehicles of a mission [m]. Like the next two fields, it must be equal in two
-    servers of a vehicle."""
+    """Smallest distance between vehicles of a mission [m]. A standby server must have the same
+    value of this field and of the next two."""
     height_m: float = 0.0
-    """Vertical distance between vehicles of a mission [m]; 0: `separation_m`."""
+    """Smallest vertical distance between vehicles of a mission [m]; 0: `separation_m`."""
     tube_m: float = 0.15
     """Largest distance of a vehicle from its motion [m]."""
 
@@ -95,7 +95,7 @@ class Terms(NamedTuple):
 
     @property
     def reach(self) -> int:
-        """Steps after the committed ones for which a horizon can be used: H, or the age bound."""
+        """Steps after the committed inputs for which a plan can be used: H, or the age bound."""
         return self.age_max if self.splines else self.horizon
 
     @property

@@ -9,6 +9,6 @@
     contradictions  values that are each valid, but not together
     events          events of a mission's vehicles (`scenario.rooms.EVENTS`)
 
-Keys are read with every scenario, the other modules with a mission. `server.missions` plans it. The
-package imports `shared.law`, `shared.scenario`, `shared.events` and `shared.base`.
+`keys` is imported with every scenario, the other modules only with a mission. `server.missions`
+plans missions. This package imports `shared.law`, `.scenario`, `.events` and `.base`.
 """

@@ -18,11 +18,11 @@ from skytether.shared.scenario.schema import Contradiction, Scenario
 TINY = 1e-9
 """Rounding tolerance of times and heights."""
 PLACES_MAX = 100_000_000
-"""Largest number of places of a show, which takes about ten seconds to check."""
+"""Largest number of positions that are checked in a show; this takes about ten seconds."""
 
 
 def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions between keys: vehicles must keep apart for any loss of packets."""
+    """Contradictions of keys with which vehicles might not keep apart if packets are lost."""
     control, link, vehicle = scenario.control, scenario.link, scenario.vehicle
     if not _is_one(SCHEMES, control.scheme, "trajectory"):
         yield "control.scheme", repr(control.scheme), "'trajectory' on a mission"
@@ -38,8 +38,8 @@ def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
         yield "link.join_s", link.join_s, f"more than 0, and at most {most_s:g} s, on a mission"
     mission = scenario.section(MissionConfig)
     if 0.0 < mission.height_m < mission.separation_m - TINY:
-        # Heights are scaled by separation_m / height_m. Tubes are as high as wide, so with a factor
-        # above 1 they would be too high.
+        # Heights are scaled by separation_m / height_m. A tube is as high as wide, so that a factor
+        # above 1 would make tubes too high.
         expected = f"0, or at least mission.separation_m ({mission.separation_m:g})"
         yield "mission.height_m", mission.height_m, expected
     if vehicle.on_loss == "return":
@@ -53,14 +53,14 @@ def of_keys(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _is_one(table: PluginTable, text: str, name: str) -> bool:
-    """Whether a text names this entry alone; an invalid text is reported elsewhere."""
+    """Whether a text consists of the entry `name` alone. Other code reports an invalid text."""
     with suppress(GrammarError):
         return table.one(text).name == name
     return table is PLANNERS
 
 
 def of_changes(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of zones and goals, which may be changed in flight."""
+    """Contradictions of zones and goals, the keys of a mission that may change in flight."""
     wrong = list(_no_zones(scenario))
     yield from wrong or _no_goals(scenario)
 
@@ -78,8 +78,8 @@ def _no_zones(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of `mission.goals`: unknown vehicle, in a zone, or too
-    near to another goal.
+    """Contradictions of `mission.goals`: a goal of an unknown vehicle, in a zone, or too near to
+    another goal.
     """
     mission = scenario.section(MissionConfig)
     if not mission.goals:
@@ -94,7 +94,7 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
         return
     assert isinstance(flown, Mission)
     apart_m, clear_m = clearances(scenario).planned_apart_m, clearances(scenario).planned_clear_m
-    # Last goals of other vehicles; with `allocate` only the server knows them.
+    # Last goals of other vehicles. They are unknown here with `allocate`: the server assigns them.
     others = () if mission.allocate else flown.vehicles
     ends = {each: flown.goals(each)[-1] for each in others if each not in goals}
     beside = " to the side" if lands(scenario) else ""

@@ -21,12 +21,12 @@ def clearances(scenario: Scenario) -> Clearances:
 
 
 def lands(scenario: Scenario) -> bool:
-    """Whether vehicles of a mission with three axes land if the server is silent."""
+    """Whether vehicles of a mission land if no packets arrive; with two axes they never land."""
     return scenario.keeps_apart and scenario.model.axes > 2 and scenario.vehicle.land_after_s > 0.0
 
 
 def rest_scale(scenario: Scenario) -> float:
-    """Factor on distances along the third axis between vehicles at rest: 0 if they may land."""
+    """Factor on vertical distances between vehicles at rest; 0 if they may land below another."""
     return 0.0 if lands(scenario) else scenario.section(MissionConfig).height_scale
 
 

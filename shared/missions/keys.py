@@ -15,14 +15,14 @@ ZONES, GOALS = "zones", "goals"
 
 
 class MissionConfig(Section, frozen=True):
-    """Mission: several vehicles with goals, which keep apart for any loss of packets; see
+    """Mission: several vehicles with goals, which keep apart whatever packets are lost; see
     docs/together.md.
     """
 
     separation_m: Term[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
     """Smallest distance between two vehicles [m]."""
     height_m: Term[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Smallest distance between two vehicles, one above the other [m]; 0: `separation_m`."""
+    """Smallest vertical distance of two vehicles above each other [m]; 0: `separation_m`."""
     tube_m: Term[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
     """Largest distance of a vehicle from its motion, by wind and tracking errors [m]."""
     speed_mps: OfServer[Strength] = 0.0
@@ -30,8 +30,8 @@ class MissionConfig(Section, frozen=True):
     acceleration_mps2: OfServer[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.6
     """Largest acceleration of a motion on an axis [m/s²]."""
     allocate: OfServer[bool] = False
-    """Whether goals are assigned to the nearest vehicles; each vehicle then needs a goal at each
-    time."""
+    """Whether goals are assigned to the nearest vehicles. All vehicles then need goals at the same
+    times."""
     goals: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, GOALS)] = ""
     """Goals that replace those of the mission: goal(vehicle, x, y), or goal(vehicle, x, y, z),
     combined with &."""
@@ -41,7 +41,7 @@ class MissionConfig(Section, frozen=True):
 
     @property
     def height_scale(self) -> float:
-        """Factor on distances along the third axis, before comparison with `separation_m`."""
+        """Factor on vertical distances before they are compared with `separation_m`."""
         return self.separation_m / self.height_m if self.height_m else 1.0
 
     def shared_terms(self) -> dict[str, Any]:

@@ -25,9 +25,9 @@ GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 TINY_MPS = 1e-6
 """Tolerance of speeds [m/s]."""
 PLACES_AT_ONCE = 1_000_000
-"""Number of places of a show that are compared at once, which bounds memory."""
+"""Number of positions of a show that are compared at once; the bound limits memory."""
 CROWDED = 32
-"""Number of simultaneous stays in neighbouring cells above which two must be too near."""
+"""Number of simultaneous stays in neighbouring cells; if there are more, two must be too near."""
 
 
 class Mission(OfFleet):
@@ -36,8 +36,8 @@ class Mission(OfFleet):
     A vehicle starts at its first goal. A vehicle without goals stays at the origin.
 
     Args:
-        goals: rising times [s; shape (n,)] and the goal from each time on [m; shape (n, axes)], by
-            number of the vehicle.
+        goals: by number of the vehicle, rising times [s; shape (n,)] and the goal from each time on
+            [m; shape (n, axes)].
         axes: number of axes.
         vehicle: number of the vehicle whose reference this is.
         is_show: whether vehicles follow straight lines from goal to goal, each reached at its time.
@@ -102,7 +102,7 @@ class Mission(OfFleet):
             height: factor on distances along the third axis.
 
         Returns:
-            numbers of the two vehicles, time [s] and distance [m]; None if there are none.
+            numbers of the two vehicles, time [s] and distance [m]; None if no two are too near.
         """
         if self.is_show:
             return _nearest_on_paths(self._goals, apart_m, height)
@@ -114,7 +114,7 @@ class Mission(OfFleet):
         return one, other, float(stays.begin_s[list(pair)].max()), stays.distance_m(*pair)
 
     def count_places(self) -> int:
-        """Number of places that `nearest` compares in a show."""
+        """Number of positions that `nearest` compares in a show."""
         times_s = np.concatenate([times_s for times_s, _ in self._goals.values()])
         return len(np.unique(times_s)) * len(self._goals)
 
@@ -139,8 +139,8 @@ class Mission(OfFleet):
     def allocated(self) -> "Mission":
         """Mission with the goals of each time allocated to vehicles by linear assignment.
 
-        It minimises the sum of the squared distances to the next goals, so that paths cross less.
-        The mission must be `in_step`.
+        The allocation minimises the sum of the squared distances to the next goals, so that paths
+        cross less. The mission must be `in_step`.
         """
         from scipy.optimize import linear_sum_assignment  # clients have no scipy
 
@@ -190,7 +190,7 @@ class _Stays(NamedTuple):
             level, index[:, axis] = np.unique(column, return_inverse=True)
             levels.append(level)
         shape = [len(level) for level in levels]
-        # Stays are sorted by time, so the index of a stay is also its rank in time.
+        # Stays are sorted by begin, so the index of a stay is also its rank.
         until = np.searchsorted(self.begin_s, self.end_s)
         own = np.ravel_multi_index(tuple(index.T), shape)
         occupied, cell = np.unique(own, return_inverse=True)
@@ -244,10 +244,10 @@ class _Stays(NamedTuple):
 def _neighbours(
     cells: Array, levels: Sequence[Array], shape: Sequence[int], occupied: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Indices of cells in the sorted list of occupied cells.
+    """Look up n cells in the sorted list of occupied cells.
 
     Returns:
-        indices of the occupied cells among them, shape (m,); and their flags, shape (n,).
+        indices in the list of the m cells that are in it; and whether each of the n cells is in it.
     """
     is_occupied = np.ones(len(cells), dtype=bool)
     index = np.empty(cells.shape, np.int64)
@@ -266,7 +266,7 @@ def _nearest_on_paths(
 ) -> tuple[int, int, float, float] | None:
     """First two vehicles of a show nearer than `apart_m` to each other, see `Mission.nearest`.
 
-    Between two consecutive goal times of any vehicles, every vehicle flies straight.
+    The times of all vehicles' goals are merged; between two successive times each flies straight.
     """
     numbers = list(goals)
     times_s = np.unique(np.concatenate([own_s for own_s, _ in goals.values()]))
@@ -286,7 +286,7 @@ def _nearest_during(
     apart_m: float,
     height: float,
 ) -> tuple[int, int, float, float] | None:
-    """First two vehicles too near between the given times, which include all times of points."""
+    """First two vehicles nearer than `apart_m` during `times_s`, which include all goals' times."""
     places = np.stack(
         [
             np.stack([np.interp(times_s, own_s, along) for along in points_m.T], axis=1)
@@ -298,7 +298,7 @@ def _nearest_during(
     for k, (begin, end) in enumerate(zip(places, [*places[1:], places[-1]], strict=True)):
         moved, middle = end - begin, 0.5 * (begin + end)
         reach_m = apart_m + float(np.linalg.norm(moved, axis=1).max())
-        # Sorted along the first axis: each vehicle is compared with the next ones within reach.
+        # Vehicles are sorted by x. Each is compared with the vehicles after it up to `reach_m`.
         order = np.argsort(middle[:, 0])
         x, rank = middle[order, 0], np.arange(len(order))
         counts = np.searchsorted(x, x + reach_m, side="right") - rank - 1
@@ -323,7 +323,7 @@ class Guided:
     Args:
         references: gives the reference of a vehicle by its number.
         goals: goals that replace those of the mission [m; shape (axes,)], by vehicle.
-        most: largest number of vehicles whose references are stored.
+        most: largest number of vehicles whose references are cached.
     """
 
     def __init__(
@@ -352,7 +352,7 @@ class Guided:
 
 
 def parse_goals(text: str, axes: int) -> dict[int, Array]:
-    """Goals in a text such as `goal(1, 2.5, 0) & goal(2, -1, 0)`, by vehicle [m; shape (axes,)].
+    """Goals by vehicle [m; shape (axes,)], from a text such as `goal(1, 2.5, 0) & goal(2, -1, 0)`.
 
     Raises:
         GrammarError: a part of the text is invalid.
@@ -373,7 +373,7 @@ def parse_goals(text: str, axes: int) -> dict[int, Array]:
 
 
 def format_goals(goals: Mapping[int, Array]) -> str:
-    """Inverse of `parse_goals`."""
+    """Text of goals, which `parse_goals` reads."""
     return " & ".join(
         f"goal({vehicle}, {', '.join(f'{at:.6g}' for at in place)})"
         for vehicle, place in goals.items()

@@ -7,7 +7,7 @@
 Numbers are metres. `box` and `cylinder` may end with two more numbers, the lowest and the highest
 altitude; otherwise they have no vertical limits. Vehicles keep out of `box`, `cylinder` and
 `polygon`, and stay within every `fence` and `corridor`. A cylinder becomes a polygon of 24 corners
-around it. `zone_files` reads the files.
+around the cylinder. `zone_files` reads the files.
 """
 
 import math
@@ -99,7 +99,7 @@ def corridor(width: float, *middle: float) -> list[Zone]:
     if width <= 0.0 or (long < 1e-6).any():
         raise ValueError("corridor(width, x, y, x, y, …): a width, and no point twice in a row")
     across = np.stack([-way[:, 1], way[:, 0]], axis=1) / long
-    # Mitre joints: the sides of two segments meet on the bisector of their angle.
+    # Mitre joints: the edges of two successive segments meet on the bisector of their angle.
     ends = np.concatenate([across[:1], across[:-1] + across[1:], across[-1:]])
     square = (ends**2).sum(axis=1, keepdims=True)
     if (square[1:-1] < 0.1).any():

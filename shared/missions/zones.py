@@ -17,7 +17,7 @@ CORNERS_MAX = 1000
 
 class Zone(NamedTuple):
     name: str
-    """Text of the zone in the scenario, or file and name of a feature."""
+    """Text of the zone in the scenario; for a zone from a file, the file and the feature's name."""
     corners: Array
     """Corners in order along the border [m]; shape (n, 2)."""
     low_m: float = -math.inf
@@ -27,7 +27,7 @@ class Zone(NamedTuple):
 
 
 class Planes(NamedTuple):
-    """Half-planes that keep points out of zones: normal · x ≥ normal · border + distance."""
+    """Half-planes that keep points out of zones: normal · (x - border) ≥ distance to be kept."""
 
     at: Indices
     """Index of the point to which each half-plane belongs; shape (n,)."""
@@ -83,8 +83,8 @@ class Zones:
         return self._with_height(signed, points[:, 2:])
 
     def in_the_way(self, points: Array, room_m: float) -> str:
-        """Name of the first zone nearer than `room_m` to a path through points; empty if there is
-        none.
+        """Name of the first zone nearer than `room_m` to the straight lines through points; empty
+        if there is none.
         """
         places = [(x, y, z[0] if z else 0.0) for x, y, *z in points.tolist()]
         pieces = list(zip(places, [*places[1:], places[-1]], strict=True))
@@ -179,7 +179,7 @@ def _outlines(zones: Sequence[Zone]) -> Outlines:
 
 
 def _facing(points: Array, places: Array, at: Indices) -> Planes:
-    """Half-planes from border places to points; pairs that coincide are left out."""
+    """Half-planes between points of a border and points; pairs that coincide are left out."""
     off = points - places
     away: Array = np.linalg.norm(off, axis=1)
     apart = away > 1e-9
@@ -187,7 +187,7 @@ def _facing(points: Array, places: Array, at: Indices) -> Planes:
 
 
 def ring(places: Array) -> Array:
-    """Corners of a polygon's ring of any winding, without a last point equal to the first.
+    """Corners of a polygon in their given order, without a last corner equal to the first.
 
     Raises:
         ValueError: there are fewer than 3 corners, or the border crosses itself.
