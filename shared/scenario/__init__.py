@@ -1,6 +1,6 @@
 """Scenarios of flights: keys, files, triggers, desired trajectories, zones, network impairments."""
 
-# Imported because it assigns a module to each table of `registry`.
+# This import assigns a module to each table of `registry`.
 from skytether.shared.scenario import rooms
 
 __all__ = ["rooms"]

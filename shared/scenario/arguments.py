@@ -35,7 +35,7 @@ def argument(table: PluginTable, text: str, at: str) -> Value:
 
 
 def _argument(table: PluginTable, text: str, at: str) -> tuple[list[Call], int]:
-    """Calls of `at`'s entry in `text`, and the index of its parameter."""
+    """Calls in `text` of the entry that `at` names, and the index of the parameter in it."""
     name, _, key = at.partition(".")
     names = [parameter.name for parameter in table[name].parameters]
     if not names or (key and key not in names):

@@ -44,7 +44,7 @@ TERMS: Mapping[str, str] = MappingProxyType(
 DECISIONS: Mapping[str, object] = MappingProxyType(
     {name: attrgetter(name)(Scenario()) for name, key in KEYS.items() if key.is_decision}
 )
-"""Keys that are chosen in flight only, and their values until then."""
+"""Keys that an operator sets in flight only, with their values until then."""
 
 
 def keys_of(*groups: str) -> frozenset[str]:
@@ -55,7 +55,7 @@ def keys_of(*groups: str) -> frozenset[str]:
 def differences(
     here: NamedTuple, there: NamedTuple, names: Mapping[str, str] = TERMS
 ) -> tuple[Difference, ...]:
-    """Fields in which two tuples differ; `names` has the dotted key of each field."""
+    """Fields in which two tuples of one class differ; `names` has the dotted key of each field."""
     return tuple(
         Difference(names[field], _text(field, ours), _text(field, theirs))
         for field, ours, theirs in zip(here._fields, here, there, strict=True)

@@ -32,8 +32,8 @@ def contradictions(
     """Contradictions of a scenario whose values are each valid.
 
     Args:
-        checked: a scenario that was checked before; if the desired trajectory is the same, it is
-            not checked again.
+        checked: a scenario that was checked before; a desired trajectory equal to this scenario's
+            is not checked again.
         any_network: whether a network too slow or too lossy for a flight is allowed.
     """
     model, control, vehicle = scenario.model, scenario.control, scenario.vehicle
@@ -178,7 +178,7 @@ def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
 def _no_policies(
     key: str, text: str, table: PluginTable, control: ControlConfig
 ) -> Iterator[Contradiction]:
-    """Contradictions of a text of policies: bad grammar, or figures that the scheme lacks."""
+    """Contradictions of a text of policies: bad grammar, or a figure that the scheme lacks."""
     try:
         expression = table.parse(text)
     except GrammarError as error:
@@ -204,7 +204,7 @@ def _no_reference(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _no_shape(scenario: Scenario) -> list[Contradiction]:
-    """Contradictions of `reference.shape`: unknown, or a plug-in's that cannot be flown."""
+    """Contradictions of `reference.shape`: unknown, or a plug-in's shape that cannot be flown."""
     ref = scenario.reference
     try:
         shape = REFERENCES.one(ref.shape)

@@ -1,8 +1,8 @@
-"""Smooth closed curves as desired trajectories: entries of the table `REFERENCES`; `points` and
-`targets` have others.
+"""Smooth closed curves as desired trajectories: entries of the table `REFERENCES`. Its other
+entries are in `points` and `targets`.
 
-Each makes a trajectory (`shared.scenario.reference`) from the keys of the scenario, like a
-plug-in's shape.
+Each function makes a desired trajectory (`shared.scenario.reference`) from the scenario's keys, as
+a shape of a plug-in does.
 """
 
 import numpy as np

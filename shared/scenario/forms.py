@@ -1,4 +1,4 @@
-"""Text forms of a table's entries in a scenario, for messages and lists."""
+"""Text forms in which a scenario writes the entries of a table, for messages and lists."""
 
 import typing
 from typing import Annotated, Any, Literal
@@ -13,11 +13,11 @@ FURTHER = {
     "min_length": "of a length from",
     "max_length": "of a length up to",
 }
-"""Words for other bounds, by their names in msgspec.Meta."""
+"""Words for all other bounds, by the bounds' names in msgspec.Meta."""
 
 
 def form(name: str, entry: Entry) -> str:
-    """Text form of an entry in a scenario, with its parameters and bounds, for messages."""
+    """Text form in which a scenario writes an entry, with parameters and bounds, for messages."""
     if not entry.parameters:
         return name
     shown = ", ".join(

@@ -23,8 +23,8 @@ ROUNDS = 10_000
 
 
 def regulator(scenario: Scenario) -> Array:
-    """Gain of the regulator along a trajectory: K on position [1/s] and velocity, then λ; shape
-    (axes, 3).
+    """Gain of the regulator along a trajectory; shape (axes, 3). Columns: K on position [1/s], K on
+    velocity, and λ.
     """
     model, control = scenario.terms().model, scenario.control
     Q, R, S = control.state_weight, control.input_weight, control.change_weight
@@ -41,15 +41,15 @@ def converged_gain(
     input_weight: float,
     change_weight: float,
 ) -> Array:
-    """Gain on position, velocity and previous input, from A and B of eq. (4), Q, R and S; shape
-    (axes, 3).
+    """Gain on position, velocity and previous input; shape (axes, 3). It follows from A and B of
+    eq. (4), Q, R and S.
 
-    Cached, because all vehicles of a scenario use it.
+    The result is cached, because all vehicles of a scenario have the same gain.
     """
     B = np.pad(np.frombuffer(b).reshape(-1, 2), ((0, 0), (0, 1)), constant_values=1.0)
     A = np.pad(np.frombuffer(a).reshape(-1, 2, 2), ((0, 0), (0, 1), (0, 1)))
     Q, R = np.diag([*state_weight, change_weight]), input_weight + change_weight
-    # Cross weight of the input and the previous input in S (u - u(k-1))², halved.
+    # Half the weight of the product u u(k-1) in S (u - u(k-1))².
     cross = np.array([0.0, 0.0, -change_weight])
     cost, before = np.tile(Q, (len(B), 1, 1)), np.zeros((len(B), 3, 3))
     gain = np.zeros_like(B)
@@ -63,6 +63,6 @@ def converged_gain(
         closed_loop = A - B[:, :, None] * gain[:, None, :]
         rolled = np.einsum("aji,ajk,akl->ail", A, cost, closed_loop)
         cost, before = Q + rolled - cross[:, None] * gain[:, None, :], cost
-    # Read-only, as the cached array is shared.
+    # Read-only, because all callers share the cached array.
     gain.setflags(write=False)
     return gain

@@ -111,7 +111,7 @@ def leaves(expression: Expression) -> Iterator[Call]:
 
 
 def calls(text: str, form: str) -> list[Call]:
-    """Parse calls joined by & only; an empty text has none. The text's length is not limited.
+    """Parse calls joined by & only; an empty text has no calls. The length is not limited.
 
     Raises:
         GrammarError: see `parse`.
@@ -144,7 +144,7 @@ def _calls(text: str, form: str) -> tuple[list[Call], str]:
 
 
 DIGITS_MAX = 300
-"""Largest number of digits of a whole number; longer ones become floats, usually infinite."""
+"""Largest number of digits of a whole number. A longer number becomes a float, usually infinite."""
 
 
 def _value(word: str) -> Value:

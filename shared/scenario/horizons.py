@@ -10,11 +10,11 @@ from skytether.shared.wire.protocol import INPUTS_MAX
 TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 LOSSY = 0.3
-"""Share of lost packets to the vehicle above which horizons must be longer."""
+"""Share of lost packets on the uplink; if more are lost, horizons must be longer."""
 
 
 def ahead_s(scenario: Scenario) -> float:
-    """Time until a plan is in force [s]: mean uplink delay, or a longer `control.delay_bound`."""
+    """Time until a plan is in force [s]: the mean uplink delay or, if longer, the delay bound."""
     control, mean_s = scenario.control, scenario.uplink.mean_s
     if control.properties.flown_as in COMMITTING and control.delay_bound != "auto":
         return max(control.delay_bound, mean_s)
@@ -31,7 +31,7 @@ def too_late(scenario: Scenario) -> Iterator[Contradiction]:
 def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
     control, axes = scenario.control, scenario.model.axes
     up, down = scenario.uplink, scenario.downlink
-    # The server's estimate of the delay: its clock map assumes half of the smallest round trip.
+    # Delay that the server estimates: its clock map takes half of the smallest round trip.
     delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
     seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
     H, dt, bound_s = control.horizon, control.dt, control.delay_bound

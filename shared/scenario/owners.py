@@ -17,14 +17,14 @@ class Owner(Enum):
     """Owner of a key: which end uses its value, and whether the ends may have different values."""
 
     BOTH = "both ends"
-    """A term of the flight: both ends predict with it, so it must be equal."""
+    """A term of the flight: both ends predict with it, so its value must be equal at both."""
     EACH = "each end"
     """Key that each end reads from its own scenario."""
     SERVER = "server"
     VEHICLE = "vehicle"
     NETEM = "netem"
     VIRTUAL_TIME = "virtual time"
-    """A property of simulated computers and clocks; without effect in real time."""
+    """A property of simulated computers and clocks. It has no effect in real time."""
 
 
 class InFlight(StrEnum):
@@ -47,7 +47,7 @@ class Key(msgspec.Struct, frozen=True):
     term: str = ""
     """Field of `Terms` for a key of both ends; empty if it has the key's name."""
     is_decision: bool = False
-    """Whether the key is set in flight only, and not set again by a later run of the process."""
+    """Whether the key is set in flight only, and forgotten when the process restarts."""
 
 
 T = TypeVar("T")

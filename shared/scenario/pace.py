@@ -19,7 +19,7 @@ TINY = 1e-9
 
 
 class TooFast(NamedTuple):
-    """First step at which a desired trajectory is too fast."""
+    """First step at which a desired trajectory is faster than the vehicle can fly."""
 
     at_s: float
     """Time in the flight [s]."""
@@ -30,14 +30,14 @@ class TooFast(NamedTuple):
 
 
 def is_known(scenario: Scenario) -> bool:
-    """Whether the desired trajectory is known before the flight: no live
-    point, target or mission.
+    """Whether the desired trajectory is known before the flight, as it is except for a live point,
+    a target and a mission.
     """
     return scenario.reference.shape not in ("live", "target") and not scenario.keeps_apart
 
 
 def excess(scenario: Scenario, velocity: Array) -> Array:
-    """Ratio of the desired speed to the vehicle's largest, on each axis; shape (n, axes).
+    """Ratio of the desired speed to the vehicle's largest speed, on each axis; shape (n, axes).
 
     `velocity` is the desired velocity [m/s]; shape (n, axes).
     """
@@ -46,14 +46,14 @@ def excess(scenario: Scenario, velocity: Array) -> Array:
 
 
 def is_too_fast(scenario: Scenario, velocity: Array) -> Flags:
-    """Whether each desired velocity exceeds the vehicle's largest on some axis; shape (n,)."""
+    """Whether a desired velocity is more than the vehicle's largest on any axis; shape (n,)."""
     over: Flags = np.any(excess(scenario, velocity) > 1.0 + TINY, axis=1)
     return over
 
 
 def first_too_fast(scenario: Scenario) -> TooFast | None:
-    """First step at which the desired trajectory is too fast; None if there is none, or if the
-    trajectory is not known before the flight.
+    """First step at which the desired trajectory is faster than the vehicle can fly; None if there
+    is no such step, or if the trajectory is not known before the flight.
     """
     if not is_known(scenario):
         return None

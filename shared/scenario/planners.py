@@ -1,8 +1,8 @@
 """Planners of `control.planner`. A plug-in's planner replaces the MPC of eq. (9).
 
-The server makes one for each vehicle, and calls its `plan` at every step;
+The server makes one planner for each vehicle, and calls its `plan` at every step;
 `server.mpc.plugin_planners` checks the result. Prediction, acknowledgements, trigger and failsafe
-are still those of the scheme.
+remain those of the scheme.
 """
 
 from typing import NamedTuple, Protocol, Self
@@ -12,8 +12,8 @@ from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.scenario.schema import Scenario
 
 planner = PLANNERS
-"""Decorator of a planner: a class made from a `Problem` and its own numbers, with the method
-`plan`, see `Planner`."""
+"""Decorator of a planner: a class with the method `plan`, see `Planner`. Its constructor takes a
+`Problem` and the planner's own numbers."""
 
 
 class Problem(NamedTuple):
@@ -57,10 +57,10 @@ class Planner(Protocol):
         Args:
             state: predicted state of the vehicle at the start of the plan [m, m/s]; shape (axes,
                 2). With the scheme "trajectory": state on the trajectory in force.
-            reference: desired states from then on, extrapolated where they are unknown [m, m/s];
-                shape (H + 1, axes, 2).
-            previous: inputs of the vehicle's last plan from then on, the last one repeated [m/s];
-                0 without one; shape (axes, H).
+            reference: desired states from the start of the plan on, extrapolated where unknown
+                [m, m/s]; shape (H + 1, axes, 2).
+            previous: inputs of the vehicle's previous plan from the start of this plan on, the last
+                one repeated [m/s]; 0 if there is no previous plan; shape (axes, H).
 
         Returns:
             inputs [m/s], shape (axes, H), which are limited to ±u_max; or, with the scheme

@@ -37,7 +37,7 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
 )
 """Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
 TABLE_BYTES_MAX, LOG_BYTES_MAX = 16_000_000, 64_000_000
-"""Largest size of `reference.file`: a table, and an autopilot's log [B]."""
+"""Largest sizes of `reference.file` [B]: of a table, and of an autopilot's log."""
 LOGS = (".ulg", ".bin")
 WAYS = ("uplink", "downlink")
 COMPARED = "compare"
@@ -63,7 +63,7 @@ def names(file: str = "") -> list[str]:
 def load(name: str) -> Scenario:
     """Load a scenario by name, or from a file by path (any text that ends in .toml).
 
-    In a file of several scenarios, one is named by its table: `compare/paper-event-gusts`.
+    A scenario in a file of several is named by file and table: `compare/paper-event-gusts`.
 
     Raises:
         ConfigError: the scenario does not exist or is invalid.
@@ -74,8 +74,8 @@ def load(name: str) -> Scenario:
 def load_base(name: str) -> Scenario:
     """Load a scenario like `load`, but without a check for contradictions.
 
-    Command-line flags are applied to it next, which may resolve a contradiction of the file;
-    `check` then judges the final values.
+    Command-line flags are applied next, and may resolve a contradiction of the file. `check` then
+    checks the final values.
 
     Raises:
         ConfigError: the scenario does not exist, or a value is invalid.
@@ -95,8 +95,8 @@ def check(
     Args:
         raw: the table.
         source: file or command line of the values, for messages.
-        checked: a scenario that was checked before; if the desired trajectory is the same, its
-            files are not read again.
+        checked: a scenario that was checked before; if its desired trajectory is the same, files
+            are not read again.
         any_network: whether a network too slow or too lossy for a flight is allowed.
 
     Raises:
@@ -164,7 +164,7 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
 
     Args:
         name: name or path of the scenario.
-        seen: scenarios that extend this one, directly or indirectly, for the detection of circles.
+        seen: scenarios that extend this one, directly or indirectly; it must not extend them.
     """
     file, _, entry = name.rpartition("/")
     if name.endswith(".toml") or name in names():
@@ -198,7 +198,7 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
 
 
 def _relative_to(folder: Path, raw: dict[str, Any], prefix: str = "") -> None:
-    """Replace file names in a raw table, which are relative to a folder, by full paths."""
+    """Replace the file names in a raw table by full paths; the names are relative to a folder."""
     for name, value in raw.items():
         key = f"{prefix}{name}"
         if isinstance(value, dict):
@@ -232,7 +232,7 @@ def _with_files(scenario: Scenario, source: str, checked: schema.Scenario | None
 
 
 def _naming_files(scenario: schema.Scenario) -> list[tuple[str, str]]:
-    """Keys whose values may name files, and these values; keys of the network for each path."""
+    """Keys whose values may name files, with their values; a network's keys for each path."""
     return [
         ("reference.file", scenario.reference.file),
         *((f"network.{way}", getattr(path, way)) for path in scenario.paths for way in WAYS),
@@ -241,7 +241,7 @@ def _naming_files(scenario: schema.Scenario) -> list[tuple[str, str]]:
 
 
 def _value(scenario: schema.Scenario, key: str) -> Any:
-    """Value of a key in an optional package's section; empty if it is not installed."""
+    """Value of a key in an optional package's section; empty if the package is not installed."""
     section, _, name = key.partition(".")
     return getattr(getattr(scenario, section, None), name, "")
 
@@ -296,7 +296,7 @@ def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _with_paths(raw: dict[str, Any], source: str) -> dict[str, Any]:
-    """Raw table in which every path has both directions, by default those of the network."""
+    """Raw table in which every path has both directions; the network's are the default."""
     network: Any = raw.get("network")
     paths = network.get("paths") if isinstance(network, Mapping) else None
     if not (isinstance(paths, list | tuple) and all(isinstance(each, Mapping) for each in paths)):

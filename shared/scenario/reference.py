@@ -21,7 +21,7 @@ FAST_MPS = 1e6
 """Largest velocity along an axis of a trajectory made from points [m/s]."""
 SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
 """Times at which a plug-in's trajectory is checked before a flight [s]: dense for two minutes, then
-increasingly sparse up to a day. Round numbers are avoided: a trajectory may have corners there."""
+increasingly sparse up to a day. They are not round numbers: a trajectory may have corners there."""
 
 Reference = Callable[[NDArray[Any]], Array]
 
@@ -40,7 +40,7 @@ class OfFleet(ABC):
 
     @abstractmethod
     def of(self, vehicle: int) -> Self:
-        """Copy whose own reference is that of another vehicle."""
+        """Copy that is the reference of another vehicle."""
 
     @abstractmethod
     def allocated(self) -> Self:

@@ -4,11 +4,11 @@
     def slip(now: Situation, mps: Annotated[float, Meta(ge=0)]) -> Flags:
         '''Sends where the velocity is off its plan by more than this many m/s.'''
 
-A table is used as the decorator of its entries, built-in or from a plug-in. The entry's name,
-bounds and help come from the decorated function or class. The program passes a fixed number of
-arguments (here `now`); the others are written in the scenario, as in `slip(0.3)` (`grammar.py`):
-numbers, and for impairments and zones also words and file names. `shell.commandline.plugins`
-imports plug-ins before a scenario is read.
+A table is used as the decorator of its entries, both of built-in entries and of those in plug-ins.
+The entry's name, bounds and help come from the decorated function or class. The program passes a
+fixed number of arguments (here `now`). The scenario has the other arguments, as in `slip(0.3)`
+(`grammar.py`): numbers, and for impairments and zones also words and file names.
+`shell.commandline.plugins` imports plug-ins before a scenario is read.
 """
 
 import inspect
@@ -41,14 +41,14 @@ UNITS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
         "": {"%": (1.0, 100.0)},
     }
 )
-"""Units allowed after a number, with multiplier and divisor, by the end of the parameter's name."""
+"""Units allowed after a number: multiplier and divisor, by the end of the parameter's name."""
 
 _NAME = re.compile(r"[a-z_]\w*(-\w+)*", re.ASCII | re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"({grammar.NUMBER.pattern})([a-z]+|%)", re.ASCII | re.IGNORECASE)
 
 
 class File(NamedTuple):
-    """File that a scenario names, with its content: type of a parameter."""
+    """File that a scenario names, with its content. A parameter of this type takes a file name."""
 
     name: str
     content: bytes
@@ -107,12 +107,12 @@ class Entry:
     """Entry of a table: a policy, shape or impairment that a scenario can name."""
 
     make: Callable[..., Any]
-    """Function or class; called with the program's arguments, then those of the scenario."""
+    """Function or class, called with the program's arguments, then the scenario's arguments."""
     parameters: tuple[Parameter, ...]
     about: str
     needs: str = ""
-    """Figure that a scheme must compute for this entry (`schemes.SchemeProperties.computes`), or
-    empty."""
+    """Figure that a scheme must compute for this entry (`schemes.SchemeProperties.computes`);
+    empty: none."""
     version: str = ""
     """Digest of a plug-in's file, or name and version of its package; empty for built-in
     entries."""
@@ -127,7 +127,7 @@ class Entry:
         return self.source.startswith("skytether.")
 
     def bound(self, call: Call) -> tuple[Value, ...] | None:
-        """Value for each parameter, from the call or by default; None if a value does not fit."""
+        """Value of each parameter, from the call or its default; None if the call is invalid."""
         named: dict[str, Value] = {}
         rest: list[Value] = []
         names = [parameter.name for parameter in self.parameters if not parameter.is_rest]
@@ -244,7 +244,7 @@ class PluginTable(dict[str, Entry]):
         return self._bound(call)
 
     def calls(self, text: str) -> list[Call]:
-        """Parse entries joined by & only; an empty text has none."""
+        """Parse entries joined by & only; an empty text has no entries."""
         return [self._bound(each) for each in grammar.calls(text, self.form)]
 
     def files(self, text: str) -> list[str]:
@@ -289,7 +289,7 @@ class PluginTable(dict[str, Entry]):
         return [(each, parameters[min(i, last)].file) for i, each in enumerate(call.values)]
 
     def with_values(self, text: str, call: Call, values: Sequence[Any]) -> str:
-        """Text in which the call's arguments are replaced by these values."""
+        """Copy of `text` in which `values` replace the arguments of the call."""
         files = [file for _, file in self._args(call)]
         shown = [
             f'"{value}"' if file else value if isinstance(value, str) else repr(value)
@@ -345,14 +345,14 @@ class PluginTable(dict[str, Entry]):
 
 
 def _forms() -> Any:
-    """Module that formats entries for messages, loaded after a user's mistake."""
+    """Module that formats entries for messages. It is loaded only after a user's mistake."""
     return load("skytether.shared.scenario.forms", "forms")
 
 
 def _parameters(
     what: str, make: Callable[..., Any], given: int, *, texts: bool
 ) -> tuple[Parameter, ...]:
-    """Parameters that a function or class takes after the `given` first ones.
+    """Parameters of a function or class without the first `given` parameters.
 
     Raises:
         ConfigError: a parameter has an unusable type, or there are fewer than `given` parameters.
@@ -410,17 +410,17 @@ PERIOD_MAX = 1_000_000
 TRIGGERS = PluginTable(
     "policy", "policies such as 'state_gap & budget(5, 2) | silence(1)'", given=1, class_=2
 )
-"""Policies of `control.trigger`. A function is called with a `Situation` at each step; a
-class once, with the control section and the largest number of vehicles. See
+"""Policies of `control.trigger`. A function is called at each step, with a `Situation`; a class is
+called once, with the control section and the largest number of vehicles. See
 `server.triggers.trigger`."""
 REPORTS = PluginTable("report", "reports such as 'deviation(0.05) | silence(1)'", given=1, class_=1)
 """Policies of `vehicle.report`, called with a `reports.Unreported` at each step. See
-`client.reports`; plug-ins cannot add any."""
+`client.reports`. Plug-ins cannot add reports."""
 REFERENCES = PluginTable("shape", "a shape such as 'circle', or 'name(1.5)'", given=1, class_=1)
 """Shapes of `reference.shape`, called with the `Scenario`. See `shared.scenario.curves`."""
 SCHEMES = PluginTable("scheme", "a scheme such as 'trajectory', or 'name(1.5)'", given=0, class_=1)
-"""Schemes of `control.scheme`. A built-in one is a function that returns its properties; a
-plug-in's is the class itself, called with a `server.planning.scheme.Fleet`. See
+"""Schemes of `control.scheme`. A built-in scheme is a function that returns the scheme's
+properties; a plug-in's scheme is a class, called with a `server.planning.scheme.Fleet`. See
 `shared.scenario.schemes`."""
 PLANNERS = PluginTable("planner", "a planner such as 'mpc', or 'name(1.5)'", given=1, class_=1)
 """Planners of `control.planner`, called with a `planners.Problem`. See

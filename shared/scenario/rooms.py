@@ -1,6 +1,6 @@
-"""Entries, keys and sections of scenarios, and the modules that add them, imported when used.
+"""Entries, keys and sections of scenarios, and the modules that define them.
 
-Their order is also that of help texts and documents. This module imports none of them.
+Help texts and documents have the same order. The modules are imported when they are used.
 """
 
 from collections.abc import Mapping
@@ -26,9 +26,9 @@ SHARED, NETEM = "skytether.shared.", "skytether.netem."
 TRIGGER = "skytether.server.triggers."
 
 APART = ("swap", "sphere", "mission", "show")
-"""Shapes with goals or paths of several vehicles, which keep apart."""
+"""Shapes with goals or paths of several vehicles that keep apart."""
 SCHEME_APART = "skytether.server.missions.planning"
-"""Module of the scheme that flies these shapes, in place of `control.scheme`."""
+"""Module of the scheme that flies the shapes of APART, in place of `control.scheme`."""
 HORIZONS = f"{SHARED}scenario.horizons"
 """Module with the contradictions of schemes that send horizons of inputs."""
 FROM_FILE = ("csv", "mission", "show")
@@ -36,8 +36,8 @@ FROM_FILE = ("csv", "mission", "show")
 ZONES = PluginTable(
     "zone", "zones such as 'box(1, 2, -1, 1) & fence(-6, 6, -6, 6)'", given=0, class_=0, texts=True
 )
-"""Zones of `mission.zones`: functions that return a list of zones. See `shared.missions.zones`;
-plug-ins cannot add any."""
+"""Zones of `mission.zones`: functions that return a list of zones. See `shared.missions.zones`.
+Plug-ins cannot add zones."""
 
 SECTIONS = {
     "link": "skytether.client.standby.keys",
@@ -46,7 +46,7 @@ SECTIONS = {
     "mavlink": "skytether.client.mavlink.keys",
     "ros2": "skytether.client.ros2.keys",
 }
-"""Optional sections, and sections with optional keys: the module that defines each in SECTION."""
+"""Module of each optional section, or of optional keys of a section; its SECTION is the class."""
 
 FILES = {"mission.zones": (ZONES, 4_000_000)}
 """Keys of optional sections whose text may name files, see `reading.FILES`."""
@@ -61,7 +61,7 @@ TEXTS: Mapping[str, PluginTable] = MappingProxyType(
         "network.downlink": IMPAIRMENTS,
     }
 )
-"""Keys whose value is a text with arguments, and the table of the entries it may name."""
+"""Keys whose value is a text with arguments; by key, the table of the entries in the text."""
 EVENTS = (
     f"{SHARED}events.aboard",
     f"{SHARED}events.ground",

@@ -51,7 +51,7 @@ from skytether.shared.scenario.schemes import SchemeProperties
 from skytether.shared.wire.framing import PATHS_MAX
 from skytether.shared.wire.protocol import INPUTS_MAX, PAYLOAD_BYTES_MAX
 
-# Bounds of numbers are far beyond any vehicle, and low enough that no time overflows 63 bits of
+# Bounds of numbers are far beyond any vehicle, but so low that no time overflows 63 bits of
 # nanoseconds and no product of several values overflows a float.
 Factor = Annotated[float, Meta(ge=1e-3, le=1e3)]
 Factors = Factor | tuple[Factor, ...]
@@ -91,7 +91,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         return ""
 
     def contradictions(self, scenario: "Scenario") -> Iterator[Contradiction]:  # noqa: ARG002
-        """Contradictions of the section's keys with others."""
+        """Contradictions of the section's keys with other keys."""
         yield from ()
 
     def contradictions_of_way(
@@ -108,7 +108,7 @@ class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         yield from ()
 
     def assigned(self, reference: shapes.Reference, vehicle: int) -> shapes.Reference:  # noqa: ARG002
-        """Desired trajectory of a vehicle after an assignment of goals, as on a mission."""
+        """Desired trajectory of a vehicle after goals were assigned to vehicles, as on missions."""
         return reference
 
 
@@ -238,7 +238,7 @@ class VehicleConfig(Section, frozen=True):
     """Fastest change of the desired velocity on an axis [m/s²]; no limit with `exhausted =
     "hold"`."""
     land_after_s: Term[Duration] = 10.0
-    """Time of hovering with a silent server before landing [s]; 0: never lands."""
+    """Time of hovering without packets of the server before landing [s]; 0: never lands."""
     on_loss: OfVehicle[Literal["land", "return"]] = "land"
     """Action after `land_after_s`: land in place, or return home by the autopilot and land
     there."""
@@ -246,8 +246,8 @@ class VehicleConfig(Section, frozen=True):
         Literal["ask", "old", "new", "stay"],
         Key(Owner.VEHICLE, InFlight.LEAP, is_decision=True),
     ] = "ask"
-    """Choice after a leap of the position, made in flight only: subtract the leap (old), accept it,
-    so that the fence moves with it (new), or hover on (stay); see docs/failsafe.md."""
+    """Choice after a leap of the position, made in flight only. old: subtract the leap; new: accept
+    it, which also moves the fence; stay: hover on. See docs/failsafe.md."""
     tau_s: OfVehicle[tuple[Factor, ...]] = ()
     """True time constant [s]; default: the model's."""
     gain: OfVehicle[Factors] = ()
@@ -436,10 +436,10 @@ class Scenario(Section, frozen=True):
         return network.paths or (PathConfig(uplink=network.uplink, downlink=network.downlink),)
 
     def on_path(self, index: int) -> Self:
-        """Scenario with one path only; each path except the first has a derived seed.
+        """Scenario with one path only. Each path except the first has a derived seed.
 
         Args:
-            index: number of the path, from 0; the number of paths: network to a standby server.
+            index: number of the path, from 0; for a standby server's network, the number of paths.
         """
         path = (*self.paths, self.paths[0])[index]
         network = msgspec.structs.replace(
@@ -537,7 +537,7 @@ class Scenario(Section, frozen=True):
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
-        """Desired trajectory of a vehicle, by its number; with the shape "target" all differ."""
+        """Desired trajectory of a vehicle, by its number; each vehicle has its own "target"."""
         reference = self.unallocated_reference(vehicle)
         for section in self.sections():
             reference = section.assigned(reference, vehicle)
@@ -574,7 +574,7 @@ class Scenario(Section, frozen=True):
 
     @property
     def keeps_apart(self) -> bool:
-        """Whether vehicles keep apart: each flies its motion to the end, or holds its position."""
+        """Whether the flight is a mission, on which the server keeps vehicles apart."""
         return self.reference.shape.partition("(")[0].strip() in rooms.APART
 
     def _tabledigest(self) -> str:
@@ -583,7 +583,7 @@ class Scenario(Section, frozen=True):
         return digest(self.table + repr(origin).encode() if self.table and origin else self.table)
 
     def _shape(self) -> str:
-        """Shape as a term: its name; for a plug-in, its text and a digest of its states."""
+        """Shape as a term: the shape's name; of a plug-in, text and a digest of the states."""
         shape = REFERENCES.one(self.reference.shape)
         if REFERENCES[shape.name].is_ours:
             return shape.name

@@ -14,7 +14,7 @@ scheme = SCHEMES
 """Decorator of a scheme."""
 
 HELD = "held"
-"""Value of `needs` for a trigger that uses the inputs that are flown if nothing is sent."""
+"""Value of `needs` for a trigger that uses the inputs that the vehicle flies without a new plan."""
 FIGURES = ("state_gap", "cost_gap", "expected_gap", "deviation_m")
 """Figures of a plan that a scheme may compute; also names of columns in the record."""
 
@@ -38,15 +38,15 @@ class SchemeProperties(NamedTuple):
 
     @property
     def computes(self) -> tuple[str, ...]:
-        """Figures that the scheme provides to triggers, and HELD if it computes the inputs that are
-        flown if nothing is sent.
+        """Figures that the scheme provides to triggers, and HELD if the scheme computes the inputs
+        that the vehicle flies without a new plan.
         """
         return (*self.figures, HELD) if self.flown_as in COMMITTING else self.figures
 
 
 @scheme
 def committed() -> SchemeProperties:
-    """Horizons of inputs, the first of which are committed: fixed by horizons sent before."""
+    """Horizons of inputs that begin with committed inputs, fixed by horizons sent before."""
     return SchemeProperties("committed", FIGURES, observes=True)
 
 

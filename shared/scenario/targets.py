@@ -9,13 +9,13 @@ from skytether.shared.scenario.registry import REFERENCES
 from skytether.shared.scenario.schema import Scenario
 
 GRID_S = 0.05
-"""Time between the random velocities of a target; they are interpolated linearly."""
+"""Time between random velocities of a target [s]; between them the velocity changes linearly."""
 TURN_S = 3600.0
-"""Time after which a target follows its path backwards, then forwards again, to bound the memory
-for the random walk."""
+"""Time after which a target follows its path backwards, then forwards again [s]. It bounds the
+memory for the random walk."""
 GRID_BLOCK = 1024
 GAINS_MAX = 10_000
-"""Largest number of steps after which the gains of a filter count as steady."""
+"""Largest number of steps until the gains of a filter count as steady."""
 
 
 def target(
@@ -92,9 +92,9 @@ class _Walk:
 class Measured:
     """States of a target as estimated from its positions, measured with noise at every step.
 
-    A Kalman filter with the steady gains K for white acceleration: prediction at constant velocity
-    over a step, then x ← x + K (z - p). A state between two steps is predicted from the last one.
-    At time 0 the target is known to be at rest.
+    A Kalman filter estimates them, with the steady gains K for white acceleration: it predicts one
+    step at constant velocity, then x ← x + K (z - p). A state between two steps is predicted from
+    the earlier step. At time 0 the target is known to be at rest.
 
     Args:
         target: true states.
@@ -120,7 +120,7 @@ class Measured:
 
     def __call__(self, t: Array) -> Array:
         t = np.maximum(np.asarray(t, dtype=np.float64), 0.0)
-        # 1e-9 covers rounding errors of a time in steps.
+        # 1e-9 covers the rounding error of the quotient.
         steps = np.floor(t / self._dt_s + 1e-9).astype(np.int64)
         self._estimate_until(int(steps.max(initial=0)))
         states = self._states[steps]

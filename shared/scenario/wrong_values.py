@@ -1,4 +1,4 @@
-"""Messages about wrong values of a scenario; loaded at the first wrong value."""
+"""Messages about wrong values of a scenario. The module is loaded at the first wrong value."""
 
 import re
 import typing
