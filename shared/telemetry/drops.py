@@ -34,8 +34,8 @@ class ProcessCounts(msgspec.Struct, frozen=True):
     uplink: DirectionCounts = DirectionCounts()
     downlink: DirectionCounts = DirectionCounts()
     refused: int | dict[str, int] = 0
-    """netem's packets without a flow; in a server's figures, refused HELLOs, which do not count as
-    dropped because they are answered."""
+    """In netem's figures, packets without a flow. In a server's figures, refused HELLOs; the server
+    answers them, so they do not count as dropped."""
     kernel_drops: int = 0
 
 
@@ -54,8 +54,8 @@ def drops(
     """Number of packets that each process dropped, by reason; only reasons that occurred.
 
     Args:
-        figures: figures of each process, by its name; those of a server's workers, and of the
-            netems of several paths, are added up.
+        figures: figures of each process, by its name. The figures of a server's workers are added
+            up, and those of the netems of several paths.
         vehicle: number of the vehicle to count in a client; None: all of its vehicles.
     """
     totals: dict[str, Counter[str]] = {}

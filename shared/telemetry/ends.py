@@ -1,11 +1,11 @@
-"""Packets at the ends: when an end was woken, and what it received and sent.
+"""Part of the record about server and client: their wakes, and the datagrams that they received
+and sent.
 
-netem sees a packet on its way; whether an end handled it before or after a tick follows from the
-order of these rows:
+The order of the rows shows whether an end handled a packet before or after a tick:
 
-    woken       by its timer
+    woken       by the end's timer
     received    a datagram
-    sent        a datagram, in response to the newest row before it that is not of this kind
+    sent        a datagram, in response to the newest previous row "woken" or "received"
 """
 
 from enum import IntEnum
@@ -18,15 +18,15 @@ COLUMNS: np.dtype[np.void] = np.dtype(
     [
         ("end", "<u1"),  # an `End`
         ("happened", "<u1"),  # a `Happened`
-        ("kind", "<u1"),  # type of the message, see docs/protocol.md; 0 if sealed, or of a wake
-        ("peer", "<u2"),  # number of the other address, in the order of their first packets
-        ("bytes", "<u2"),  # UDP payload
+        ("kind", "<u1"),  # type of the message, see docs/protocol.md; 0: encrypted, or a wake
+        ("peer", "<u2"),  # number of the other address, in the order of first packets
+        ("bytes", "<u2"),  # size of the UDP payload
         ("packet", "<i8"),  # hash of the payload, the same at both ends
-        ("time_ns", "<i8"),  # [clock of the process]
-        ("due_ns", "<i8"),  # of a wake, the time for which the timer was set [same clock]; else 0
+        ("time_ns", "<i8"),  # time of the row, on the clock of the process
+        ("due_ns", "<i8"),  # time for which the timer of a wake was set [same clock]; else 0
     ]
 )
-"""Columns of the part: a row for each wake and each datagram, without those of an autopilot."""
+"""Columns of the part: a row for each wake and each datagram, except an autopilot's datagrams."""
 
 
 class End(IntEnum):

@@ -27,7 +27,7 @@ def kinds(base: type[Event] = Event) -> Iterator[type[Event]]:
             yield kind
 
 
-# Classes are searched, not listed, so that none is forgotten. For mypy the union is `Event`.
+# The search for classes replaces a list of them. For mypy the union is `Event`.
 if TYPE_CHECKING:
     EveryEvent = Event
 else:

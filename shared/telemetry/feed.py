@@ -1,9 +1,9 @@
 """Feed of a process: its record and events, for observers during the flight.
 
 A feed is a stream of frames, each a length (`LENGTH_BYTES`, big-endian) followed by as many bytes
-of msgpack. The first is `Opened`; `Rows` follow for the parts of the record that it names. An
-observer that connects late gets the most recent frames, starting with a complete one. A reader that
-is too slow is disconnected; the process never waits for readers (`shell.driving.feed`).
+of msgpack. The first frame is `Opened`, which names parts of the record; `Rows` of these parts
+follow. An observer that connects late gets the most recent complete frames. A reader that is too
+slow is disconnected; the process never waits for readers (`shell.driving.feed`).
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from skytether.shared.telemetry.record import Rows as Table
 LENGTH_BYTES = 4
 FRAME_BYTES_MAX = 4 * 1024 * 1024
 ROW_BYTES_MAX = 4096
-"""Largest size of a row [B]; a plan of 270 inputs has about 1200."""
+"""Largest size of a row [B]; a plan of 270 inputs has about 1200 B."""
 
 
 class FeedError(ValueError):
@@ -36,7 +36,7 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=
     scenario: str
     """The scenario as TOML, with all changes in flight so far."""
     parts: dict[str, str]
-    """Parts of the record in this feed: columns by name of the part, as numpy's description in
+    """Columns of each part of the record in this feed, by the part's name: numpy's description as
     JSON."""
     directions: Directions = msgspec.field(name="ways", default=FLIGHT)
     """Names of both directions of the process's network."""

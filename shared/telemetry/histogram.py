@@ -32,7 +32,7 @@ class Histogram:
         self.largest_ns = largest_ns
 
     def quantile_ms(self, share: float) -> float:
-        """Upper edge of the bin that contains a quantile [ms]; 0 without durations."""
+        """Upper edge of the bin that contains a quantile [ms]; 0 if there are no durations."""
         wanted, seen = share * sum(self.counts), 0
         for index, count in enumerate(self.counts):
             seen += count
@@ -41,9 +41,9 @@ class Histogram:
         return self.largest_ns / MILLISECOND_NS
 
     def within(self, edges_ms: Sequence[float]) -> dict[str, int]:
-        """Number of durations below each ascending edge, by the edge as text [ms]; "inf" for all.
+        """Number of durations below each edge, by the edge as text [ms]; "inf": all durations.
 
-        A bin that contains an edge counts as above the edge.
+        Edges must ascend. A bin that contains an edge counts as above the edge.
         """
         counts_below, seen, index = {}, 0, 0
         for edge_ms in edges_ms:
@@ -53,7 +53,7 @@ class Histogram:
         return {**counts_below, "inf": seen + sum(self.counts[index:])}
 
     def by_bin(self) -> dict[str, int]:
-        """Counts by the lower edge of the bin as text [ms], such as "20"; without empty bins."""
+        """Counts of the bins that are not empty, by lower edge as text [ms], such as "20"."""
         return {
             f"{index * self.bin_ns / MILLISECOND_NS:g}": count
             for index, count in enumerate(self.counts)

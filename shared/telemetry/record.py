@@ -2,8 +2,8 @@
 
 Each process writes its own part: the client the inputs that it flew, the server its estimates and
 decisions, netem the fate of every packet. A part is a line of JSON that names the columns, followed
-by the rows as in memory. A part may end anywhere, for example when its process is killed: an
-incomplete last row is left out.
+by the rows as in memory. A part may end anywhere, for example because its process was killed;
+readers leave out an incomplete last row.
 """
 
 import hashlib
@@ -86,7 +86,7 @@ class Compared(IntEnum):
     EXPECTED_GAP = 3
     DEVIATION_M = 4
     OWN = 5
-    """A figure that a plug-in's policy computes, in its own unit."""
+    """A figure that a plug-in's policy computes, in the policy's own unit."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -99,14 +99,14 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("vehicle", "<u2"),
             ("step", "<i8"),
             ("state", "<f8", (axes, 2)),  # true state [m, m/s]; of a real vehicle, the estimate
-            ("measured", "<f8", (axes, 2)),  # measured since the last step [m, m/s]; NaN if not
+            ("measured", "<f8", (axes, 2)),  # measured since the last step [m, m/s], or NaN
             ("estimate", "<f8", (axes, 2)),  # state used by feedback and observations [m, m/s]
             ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
             ("covered", "?"),  # whether the input is from a horizon: not when hovering or braking
-            ("in_force", "<i8"),  # step that the horizon in force was made for; -1 if none is
-            ("age_ns", "<i8"),  # age of the observation of the horizon in force; -1 if none is
-            ("stale", "<i8"),  # number of horizons that arrived after a newer one, so far
-            ("missed", "<i8"),  # number of missed steps so far
+            ("in_force", "<i8"),  # step for which the horizon in force was made; -1: no horizon
+            ("age_ns", "<i8"),  # age of the observation of the horizon in force; -1: no horizon
+            ("stale", "<i8"),  # horizons so far that arrived after a newer horizon
+            ("missed", "<i8"),  # missed steps so far
             ("mode", "<u1"),  # mode from this step on, a `shared.wire.protocol.Mode`
             ("reason", "<u1"),  # reason for the mode, a `Reason`
         ]
@@ -129,8 +129,8 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
             ("input", "<f8", (axes,)),  # û(k), or the committed input of k
             ("observed_step", "<i8"),  # step of the observation from which x̂ was predicted
-            # state_gap [cost], cost_gap [cost], expected_gap [cost], deviation_m [m]; NaN without a
-            # plan, or without a trigger that needs expected_gap
+            # state_gap, cost_gap, expected_gap [all: cost], deviation_m [m]. NaN without a plan;
+            # expected_gap also without a trigger that needs it
             *((figure, "<f8") for figure in properties(scheme).figures),
             (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, or NaN
             ("threshold", "<f8"),  # threshold of the compared figure, or 0
@@ -138,8 +138,8 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             ("event", "?"),
             ("solved", "?"),
             ("solve_ns", "<i8"),  # time of both MPCs for all vehicles; -1 if not measured
-            ("stale", "<i8"),  # number of observations that arrived after a newer one, so far
-            ("missed", "<i8"),  # number of missed ticks so far
+            ("stale", "<i8"),  # observations so far that arrived after a newer observation
+            ("missed", "<i8"),  # missed ticks so far
         ]
     )
 
@@ -156,7 +156,7 @@ def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
             ("step", "<i8"),  # k, the step of the plan
             ("begins", "<i8"),  # step of the first planned input, k + d
             ("state", "<f8", (axes, 2)),  # x̂(k+d), the state from which the inputs start [m, m/s]
-            ("inputs", "<f4", (axes, planned)),  # desired velocities, one a step [m/s]
+            ("inputs", "<f4", (axes, planned)),  # desired velocity of each step [m/s]
             ("disturbance", "<f8", (axes,)),  # ŵ, disturbance assumed in the prediction [m/s]
         ]
     )
@@ -172,9 +172,9 @@ PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
         ("path", "<u1"),  # number of the session's path, from 0
         ("flow", "<u4"),  # number of the client
         ("number", "<u4"),  # number of the packet in its flow and direction
-        ("bytes", "<u2"),  # UDP payload; with `netem run` the IP packet
+        ("bytes", "<u2"),  # size of the UDP payload; with `netem run`, of the IP packet
         ("arrived_ns", "<i8"),  # time of arrival at netem [netem's clock]
-        ("delay_ns", "<i8"),  # drawn delay, also of a lost packet
+        ("delay_ns", "<i8"),  # drawn delay; a lost packet has one, too
         ("lost", "?"),
         ("overtaken", "?"),  # whether a later packet of the flow left earlier
     ]
@@ -211,7 +211,7 @@ class Recorder:
         self._sinks.append(sink)
 
     def append(self, count: int, **values: Any) -> None:
-        """Append `count` rows; a value is a scalar for all rows, or an array of one per row."""
+        """Append `count` rows. Each value is a scalar for all rows, or an array by row."""
         rows = np.zeros(count, self.columns)
         for name, value in values.items():
             rows[name] = value
@@ -219,7 +219,7 @@ class Recorder:
             sink.write(rows.tobytes())
 
     def append_row(self, *values: float) -> None:
-        """Append one row, faster than `append`: a value for every column, arrays flattened."""
+        """Append one row, faster than `append`. `values` has all columns, with arrays flattened."""
         row = self._row.pack(*values)
         for sink in self._sinks:
             sink.write(row)

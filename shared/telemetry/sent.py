@@ -11,7 +11,7 @@ from skytether.shared.telemetry.record import Compared, Rows
 def compared(rows: Rows) -> Array:
     """Figure that the trigger compared in each row of the server's part; shape (n,).
 
-    If nothing was compared it is V(k) of eq. (16), or NaN without a figure V(k).
+    If nothing was compared, the figure is V(k) of eq. (16), or NaN if the scheme has no V(k).
     """
     names = rows.dtype.names or ()
     figures = np.full(len(rows), np.nan)

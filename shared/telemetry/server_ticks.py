@@ -10,7 +10,7 @@ from skytether.shared.law.model import Flags, Indices
 from skytether.shared.telemetry.record import UPLINK, Record, Rows
 
 PACKETS, PLANS = 400, 50
-"""Number of packets and of plans of a vehicle that are compared."""
+"""Numbers of first packets and first plans of a vehicle from which `begin_ns` finds tick 0."""
 
 
 def ticks(server: Rows) -> Indices:
@@ -26,7 +26,7 @@ def ticks(server: Rows) -> Indices:
 
 
 def flows(record: Record) -> dict[int, int]:
-    """Vehicle of each flow; empty for flights over UDP, in which hosts have no numbers."""
+    """Vehicle of each flow; empty for flights over UDP, whose records do not name it."""
     return {
         each.event.flow: int(each.event.host.rpartition(".")[2])
         for each in record.events
@@ -35,8 +35,8 @@ def flows(record: Record) -> dict[int, int]:
 
 
 def begin_ns(record: Record, dt_ns: int) -> int | None:
-    """Time at which the packets of tick 0 leave, in virtual time [ns]: chosen so that most plans
-    coincide with a packet, to a millisecond where ticks come late. None if no plan does.
+    """Time at which the packets of tick 0 leave, in virtual time [ns]. The result is the time at
+    which most plans coincide with a packet, to a millisecond; None if no plan does.
     """
     own, server = flows(record), record.server
     sent, times = server[server["event"]], Counter[int]()
@@ -53,7 +53,7 @@ def begin_ns(record: Record, dt_ns: int) -> int | None:
 
 
 def are_plans(record: Record, packets: Rows, dt_ns: int) -> Flags:
-    """Whether each packet has a plan: it leaves at a tick at which the server sends one."""
+    """Whether each packet has a plan: it leaves at a tick at which the server sends a plan."""
     began_ns, own = begin_ns(record, dt_ns), flows(record)
     if began_ns is None:
         return np.zeros(len(packets), dtype=np.bool_)

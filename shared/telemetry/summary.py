@@ -18,8 +18,8 @@ from skytether.shared.telemetry.sent import sent_by
 from skytether.shared.wire.protocol import NO_HORIZON, Mode
 
 AT_BOUND = 1.0 - 1e-6
-"""Share of the bound above which an input counts as bounded: inputs are rounded when they are
-sent."""
+"""Share of the bound above which an input counts as bounded. It is below 1, because inputs are
+rounded when they are sent."""
 WORSE = (Mode.BRAKE, Mode.LAND, Mode.RETURN, Mode.FAULT)
 """Modes in which a vehicle no longer follows its plan because something went wrong."""
 STOPPED = (*WORSE, Mode.HOVER, Mode.INIT, Mode.SYNC, Mode.READY)
@@ -102,11 +102,11 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Mean age of information: the age of the observation from which the input was computed [s],
     over the steps from `settle` on."""
     aoi_s_peak: float | None
-    """Mean of the peaks of the age of information [s]: its value at each step before it
-    decreases."""
+    """Mean of the peaks of the age of information [s]. A peak is the age at a step after which the
+    age decreases."""
     plan_age_s_mean: float | None
-    """Mean time since the horizon in force was made [s], over the steps from `settle` on: the age
-    of information that only the server knows, such as the position of a target."""
+    """Mean time since the horizon in force was made [s], over the steps from `settle` on. This is
+    the age of information that only the server has, such as the position of a target."""
     effort_mps: float | None
     """Root mean square of the change of the input from step to step, over all axes together, from
     `settle` on [m/s]."""
@@ -236,7 +236,7 @@ def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Arr
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
     Only the server's record has the position of a live point and the goal of a vehicle on a
-    mission: at a step without a row the previous row counts. NaN if unknown.
+    mission. A step without a row there gets the value of the previous row. NaN: unknown.
 
     Args:
         client: rows of the vehicle.
@@ -272,7 +272,7 @@ def position_error(scenario: Scenario, client: Rows, server: Rows | None = None)
 def _estimate_error(scenario: Scenario, client: Rows) -> Array:
     """Error of the position used by feedback [m]; shape (steps, axes).
 
-    With a dead time, the true position is that of a dead time later; NaN after the flight.
+    With a dead time, the true position is taken one dead time later; NaN after the flight's end.
     """
     flown_by: Array = client["estimate"][..., 0]
     true = client["state"][..., 0]
@@ -313,7 +313,7 @@ def _paths(scenario: Scenario, netem: Rows | None) -> list[tuple[int, int]] | No
 
 
 def _rates(netem: Rows | None, duration_s: float) -> dict[str, float]:
-    """Packet and data rates, up, down and both ways; empty if not measured."""
+    """Packet and data rates of uplink, downlink and both together; empty if not measured."""
     if netem is None or duration_s == 0.0:
         return {}
     packets, sizes = {}, {}
@@ -354,8 +354,8 @@ def separations(
     A vehicle is on the mission from the first step at which it follows a plan.
 
     Args:
-        each: rows of the client's part of each vehicle, in order of steps.
-        began_s: time at which step 0 of each began, on a common clock [s].
+        each: for each vehicle, its rows of the client's part, in order of steps.
+        began_s: for each vehicle, the time at which its step 0 began, on a common clock [s].
         dt_s: length of a step [s].
         height_scale: factor of distances along the third axis, see `MissionConfig`.
 
@@ -380,7 +380,7 @@ def track(
 ) -> Track:
     """Positions of a vehicle over time; arguments as in `separations`.
 
-    `whole` begins with the first row instead of the first step on the mission.
+    With `whole` the positions begin with the first row, not the first step on the mission.
     """
     flown = rows if whole else rows[np.argmax(rows["mode"] == Mode.TRACK) :]
     at = flown["state"][:, :, 0].copy()

@@ -2,13 +2,12 @@
 
     DATA    version u8 | type u8 | vehicle u16 | channel u32 | counter u64 | sealed message
 
-Integers are little-endian. The header is authenticated with the message; the counter, which counts
-the packets of one direction from 0, is the nonce as in Noise: four zero bytes, then the counter.
-Each direction has its own key, so that a packet sent back to its sender is not accepted. Counters
-are in memory only: after a restart there is a new handshake with new keys.
+Integers are little-endian. The header is authenticated with the message. The counter counts the
+packets of one direction from 0. The nonce is four zero bytes, then the counter, as in Noise. Each
+direction has its own key, so that a packet sent back to its sender is not accepted. Counters are in
+memory only: after a restart there is a new handshake with new keys.
 
-The receiving end enforces the limits (LIFE_NS, PACKETS_MAX), so that the sending end does not have
-to.
+Only the receiving end enforces the limits LIFE_NS and PACKETS_MAX.
 """
 
 import struct
@@ -23,19 +22,19 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 VERSION = 1
 """First byte of every sealed packet; no plaintext message begins with it."""
 DATA = 4
-"""Type of a packet of a channel; those of the handshake are in `shared.wire.handshake`."""
+"""Type of a packet of a channel; the handshake's types are in `shared.wire.handshake`."""
 HEADER = struct.Struct("<BBHIQ")
 """Version, type, vehicle, channel and counter."""
 OVERHEAD_BYTES = HEADER.size + 16
-"""Length of header and tag of a packet [B]."""
+"""Length of a packet's header and authentication tag [B]."""
 
 WINDOW = 2048
-"""Number of newest counters that are tracked; a packet with an older one is not opened."""
+"""Number of newest counters that are tracked; a packet with an older counter is not opened."""
 RECENT, REPEATS = 64, 2
 """Number of newest counters whose repeats are checked, and largest number of checks until a newer
 packet arrives, see `Channel.repeats`."""
 FRESH_NS, FRESH_PACKETS = 300 * SECOND_NS, 2**22
-"""Age and number of packets of a channel after which a new one is needed."""
+"""Age and number of packets of a channel after which a new channel is needed."""
 LIFE_NS, PACKETS_MAX = 600 * SECOND_NS, 2**32
 """Age and number of packets after which no packet of the channel is opened."""
 OVERLAP_NS = 10 * SECOND_NS
@@ -55,8 +54,8 @@ def kind(packet: bytes) -> int:
 
 
 def address(packet: bytes) -> tuple[int, int]:
-    """Numbers of the vehicle and of the channel in a packet of type DATA; ProtocolError if too
-    short.
+    """Numbers of the vehicle and of the channel in a packet of type DATA; raises ProtocolError if
+    the packet is too short.
     """
     if len(packet) < OVERHEAD_BYTES:
         raise ProtocolError(Drop.LENGTH)
@@ -90,7 +89,7 @@ class ReplayWindow:
         if back >= 0:
             self._seen |= 1 << back
             return
-        # A shift by more would make a number with as many bits as the jump.
+        # A larger shift would make a number with as many bits as the counter has advanced.
         self._seen = (self._seen << min(-back, WINDOW) | 1) & _MASK
         self.newest = counter
 
@@ -100,7 +99,7 @@ class Channel:
 
     Args:
         seal: key for packets that this end sends.
-        open_: key for packets that it receives.
+        open_: key for packets that this end receives.
         born_ns: time of the handshake.
     """
 
@@ -150,14 +149,14 @@ class Channel:
         if now_ns > self._opens_until_ns or counter >= PACKETS_MAX:
             raise ProtocolError(Drop.EXPIRED)
         window = self._window
-        # Before the check of the tag, so that a repeated packet needs no cryptography.
+        # This check precedes that of the tag, so that a repeated packet needs no cryptography.
         if not window.is_new(counter):
             raise ProtocolError(Drop.REPLAYED)
         try:
             payload = self._open(_NONCE.pack(counter), packet[HEADER.size :], packet[: HEADER.size])
         except InvalidTag:
             raise ProtocolError(Drop.FORGED) from None
-        # After the check of the tag, because a forged counter must not move the window.
+        # The window moves after the check of the tag, so that no forged counter can move it.
         newest = counter > window.newest
         window.add(counter)
         self._repeats = 0 if newest else self._repeats
@@ -166,7 +165,7 @@ class Channel:
     def repeats(self, packet: bytes) -> bool:
         """Whether a packet is authentic and repeats one of the newest packets.
 
-        The check needs cryptography: at most REPEATS packets are checked per newer packet.
+        The check needs cryptography, so at most REPEATS packets are checked until a newer arrives.
         """
         (counter,) = _COUNTER.unpack_from(packet, _PREFIX.size)
         back = self._window.newest - counter
@@ -181,7 +180,7 @@ class Channel:
 
     def retire(self, *, now_ns: int) -> None:
         """Open only packets that are still in flight, for OVERLAP_NS from now on."""
-        # The earlier of both times: `retire` never prolongs the life of a channel.
+        # The minimum, because `retire` must never prolong the life of a channel.
         self._opens_until_ns = min(self._opens_until_ns, now_ns + OVERLAP_NS)
 
     def wants_successor(self, now_ns: int) -> bool:

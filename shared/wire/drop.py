@@ -1,8 +1,8 @@
 """Reasons for dropping a datagram, and the error that has such a reason.
 
-A dropped datagram is an error of the peer or the network: it is counted by reason and never
-answered. Message codec (`protocol`), encryption (`channel`, `handshake`) and both ends raise the
-same error. Rooms have further reasons, where they are found.
+A dropped datagram is an error of the peer or the network. Dropped datagrams are counted by reason
+and never answered. Message codec (`protocol`), encryption (`channel`, `handshake`) and both ends
+raise the same error. Optional packages define further reasons in their own modules.
 """
 
 from enum import StrEnum
@@ -11,7 +11,7 @@ from enum import StrEnum
 class Drop(StrEnum):
     """Reason for dropping a datagram; the value is its text in logs and its name in metrics."""
 
-    # The datagram is not a message.
+    # The datagram is no valid message.
     TOO_LONG = "too long"
     NOT_MSGPACK = "not msgpack"
     NOT_A_MESSAGE = "not a message"
@@ -27,7 +27,7 @@ class Drop(StrEnum):
     NOT_FOR_A_SERVER = "not for a server"
     NOT_FOR_A_CLIENT = "not for a client"
     OF_ANOTHER_VEHICLE = "of another vehicle"
-    """The message names another vehicle than the one whose key encrypted it."""
+    """The message names one vehicle, but was encrypted with the key of another."""
     FOR_ANOTHER_LIFE = "for another life"
     """The message answers an earlier run of the client."""
     UNKNOWN_SESSION = "unknown session"
@@ -48,7 +48,7 @@ class Drop(StrEnum):
     TOO_MANY_HANDSHAKES = "too many handshakes"
 
     OVERTAKEN = "overtaken"
-    """A message that was sent later by more than the time-out has arrived earlier."""
+    """A message that was sent more than a time-out later has already arrived."""
     COPY = "copy"
     """The message has already arrived over another path."""
 
@@ -65,7 +65,7 @@ class Drop(StrEnum):
     TOO_EARLY = "too early"
     """A mission's motion begins at a step that is in the future of the vehicle."""
     TOO_LATE = "too late"
-    """The horizon arrived after its last input was due, or so late that other inputs were flown."""
+    """The horizon arrived after its end or `link.join_s`, or too late for its committed inputs."""
     NOT_TAKEN = "not taken"
 
 

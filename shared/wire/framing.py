@@ -1,6 +1,6 @@
 """Loss report that precedes a message in a session with several paths.
 
-`shared.wire.paths` explains its contents; an end with a single link ignores it.
+`shared.wire.paths` explains the contents. An end with a single path ignores the report.
 """
 
 from struct import Struct

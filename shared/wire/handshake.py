@@ -7,10 +7,10 @@
 | 3    | RESPONSE   | server  | 5      | channel u32, Noise message 2 (48 + WELCOME),    | < 512 |
 |      |            |         |        | MAC 16                                          |       |
 
-The header is version u8, type u8, vehicle u16 and the number of its key u8. The MAC is a keyed
-BLAKE2s over everything before it, and in an answer also over the client's ephemeral key: a packet
-from another peer, or for another attempt, is dropped before any costly computation. The HELLO in
-message 1 is padded, so that no answer is longer than its request.
+The header is version u8, type u8, vehicle u16 and the number of the vehicle's key u8. The MAC is a
+keyed BLAKE2s over everything before the MAC; in an answer also over the client's ephemeral key. So
+a packet of another peer, or for another attempt, is dropped before any costly computation. The
+HELLO in message 1 is padded, so that no answer is longer than its request.
 """
 
 import hashlib
@@ -33,11 +33,11 @@ CHANNEL = struct.Struct("<I")
 COOKIE_BYTES = 16
 MAC_BYTES = 16
 INITIATION_BYTES = 512
-"""Size of an INITIATION, which no answer exceeds [B]."""
+"""Size of an INITIATION [B]. No answer is larger."""
 CHALLENGE_BYTES = HEADER.size + COOKIE_BYTES + MAC_BYTES
 RESPONSE_BYTES_MIN = HEADER.size + CHANNEL.size + MESSAGE_BYTES + MAC_BYTES
 NO_COOKIE = bytes(COOKIE_BYTES)
-"""Cookie of a client that has not received one."""
+"""Cookie in the INITIATION of a client that has not received a cookie."""
 
 _GREETINGS = (1, 2)
 _PROLOGUE = b"skytether 1"
@@ -60,7 +60,7 @@ class Response(NamedTuple):
 def check_place(message: bytes, *, in_handshake: bool) -> None:
     """Refuse a HELLO or WELCOME in a channel, and any other message in a handshake.
 
-    An attacker may replay a packet of the handshake, so no other message is accepted in one.
+    An attacker may replay a packet of the handshake, so it must contain no other message.
 
     Raises:
         ProtocolError: the message is in the wrong place, even if its sender has the key.
@@ -105,8 +105,8 @@ def write_response(key: VehicleKey, channel: int, message: bytes, public: bytes)
 
 
 def address(packet: bytes) -> tuple[int, int]:
-    """Numbers of the vehicle and of its key in an INITIATION; ProtocolError if
-    its length is wrong.
+    """Numbers of the vehicle and of its key in an INITIATION; raises ProtocolError if the packet's
+    length is wrong.
     """
     if len(packet) != INITIATION_BYTES:
         raise ProtocolError(Drop.LENGTH)
@@ -141,8 +141,8 @@ def read_response(key: VehicleKey, packet: bytes, public: bytes) -> Response:
 
 
 def is_authentic(key: VehicleKey, packet: bytes, public: bytes = b"") -> bool:
-    """Whether a packet's sender has the key; `public`: client's ephemeral key, in an answer."""
-    # In constant time: otherwise the time would reveal how many bytes of a guess are right.
+    """Whether a packet's sender has the key. `public`: the client's ephemeral key, for answers."""
+    # The comparison takes constant time; otherwise its time would reveal how many bytes are right.
     return hmac.compare_digest(packet[-MAC_BYTES:], _mac(key, packet[:-MAC_BYTES] + public))
 
 

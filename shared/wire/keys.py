@@ -3,8 +3,8 @@
     # vehicle  key  secret
     1 1 6f5e…  (64 hexadecimal digits)
 
-A vehicle has one key, or, during a key change, two: the present and the next one. No message and no
-`repr` contains a secret.
+A vehicle has one key; during a change of keys it has two, the present and the next key. No message
+and no `repr` contains a secret.
 """
 
 import hashlib
@@ -64,7 +64,7 @@ class Keyring:
         return [number for number in NUMBERS if (vehicle, number) in self.keys]
 
     def of(self, vehicle: int, number: int | None = None) -> VehicleKey:
-        """Key that a vehicle uses: the one with a number, or by default with the highest.
+        """Key that a vehicle uses: the key with the given number, by default the highest number.
 
         Raises:
             ConfigError: the vehicle has no such key.
@@ -86,7 +86,7 @@ def load(path: Path, *, is_input: bool = True) -> Keyring:
     """Keys in a file.
 
     Args:
-        is_input: whether the command must not write the file.
+        is_input: whether the command only reads the file.
 
     Raises:
         ConfigError: the file has no keys, or users other than its owner can read or write it.
@@ -105,7 +105,7 @@ def parse(name: str, content: bytes) -> Keyring:
     """Keys in the content of a file.
 
     Raises:
-        ConfigError: there are none, or a line is invalid; the message names `name`.
+        ConfigError: there are no keys, or a line is invalid; the message has `name`.
     """
     keys: dict[tuple[int, int], VehicleKey] = {}
     counts: dict[int, int] = {}

@@ -1,9 +1,9 @@
 """LEAD, the message about the server that leads a vehicle, and the leadership number in plans.
 
-`protocol` has its type number, and imports this module when needed, like `path_proof`. HORIZON and
-TRAJECTORY to a vehicle with two servers have one more field at the end:
+`protocol` has the type number of LEAD and imports this module when needed, like `path_proof`.
+HORIZON and TRAJECTORY to a vehicle with two servers have one more field at the end:
 
-    leadership  number of the leadership for which the plan was made, see `Lead`; 0 is not sent
+    leadership  leadership number for which the plan was made, see `Lead`; 0 is not sent
 """
 
 from typing import NamedTuple
@@ -39,23 +39,23 @@ PLANS = {number_of(plan): len(plan._fields) + 3 for plan in (Horizon, Trajectory
 
 
 class Lead(NamedTuple):
-    """LEAD: the server that leads a vehicle. A server answers with the same number, and with the
-    largest number received from any vehicle of its mission.
+    """LEAD: names the server that leads a vehicle. The server answers with the same leadership
+    number, and with the largest number that any vehicle of its mission has sent.
     """
 
     vehicle: int
     session: int
     number: int
-    """Number of the leadership, which only rises; plans with another number are not flown."""
+    """Leadership number. It only rises, and plans with another leadership number are not flown."""
     leads: int
-    """1 if `number` means that the server of this session leads the vehicle, else 0."""
+    """1 if the server of this session leads the vehicle, else 0."""
     largest: int = 0
-    """Largest number that the server has received; 0 from a vehicle."""
+    """Largest leadership number that the server has received; 0 from a vehicle."""
     step: int = 0
-    """Step k in which the vehicle sends, on its grid; from a server, the step in the vehicle's
-    newest LEAD. The next three fields are empty from a server."""
+    """From a vehicle, its step k at which it sends; from a server, the step in the vehicle's newest
+    LEAD. A server leaves the next three fields empty."""
     in_force: int | None = None
-    """Step that the motion in force was made for; None without one."""
+    """Step for which the motion in force was made; None if no motion is in force."""
     spacing: int = 0
     """Steps from one knot of the motion in force to the next."""
     knots: NDArray[np.float32] | bytes = b""
@@ -63,18 +63,18 @@ class Lead(NamedTuple):
     limits: Limits | None = None
     """Limits of the server's motions; None from a vehicle, or without a mission."""
     changes: int = 0
-    """Number of changes of `limits` in the server's run."""
+    """Number of changes of `limits` since the server started."""
 
 
 def with_leadership(number: int, plan: bytes) -> bytes:
-    """Encoded plan with the number of its leadership appended as last field, unless it is 0."""
+    """Encoded plan with the leadership number as last field, or without it if `number` is 0."""
     if not number:
         return plan
     return bytes([plan[0] + 1]) + plan[1:] + msgpack.packb(number)  # the array has one more element
 
 
 def decode_led(payload: bytes, terms: Terms) -> tuple[Message, int]:
-    """Message in a datagram, and the number of its leadership if it is a plan, else 0.
+    """Message in a datagram, and the leadership number of a plan; 0 for all other messages.
 
     Raises:
         ProtocolError: the datagram is not one of our messages.

@@ -3,9 +3,9 @@
     initiator → responder    psk, e      encrypted with the pre-shared key
     responder → initiator    e, ee       also with the shared secret of both ephemeral keys
 
-It follows The Noise Protocol Framework, revision 34 (sections 5, 7.5 and 9), with the names used
-there. Each derived key encrypts one payload, so every nonce is 0. All objects are immutable: a
-message can be answered, and an answer opened, more than once, each time with different keys.
+The module follows The Noise Protocol Framework, revision 34 (sections 5, 7.5 and 9), and uses its
+names. Each derived key encrypts one payload, so every nonce is 0. All objects are immutable: a
+message can be answered several times, and several answers opened, each time with different keys.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ MESSAGE_BYTES = KEY_BYTES + TAG_BYTES
 
 _NONCE = bytes(12)
 
-# The first key imports OpenSSL's bindings: made here, so that no server is delayed at a HELLO.
+# The first key imports OpenSSL's bindings. It is made here, so that no HELLO is delayed.
 X25519PrivateKey.from_private_bytes(bytes(KEY_BYTES))
 
 
@@ -131,7 +131,7 @@ class Responder:
         message: first message of the initiator.
 
     Raises:
-        NoiseError: the message is invalid, or of another key or prologue.
+        NoiseError: the message is invalid, or the initiator has another key or prologue.
     """
 
     def __init__(self, psk: bytes, prologue: bytes, message: bytes) -> None:
@@ -141,7 +141,7 @@ class Responder:
         self._state, self.payload = state.open(message[KEY_BYTES:])
 
     def answer(self, private: bytes, payload: bytes) -> tuple[bytes, Keys]:
-        """Second message, and the derived keys; `private` is an ephemeral key that was never used.
+        """Second message and derived keys. `private` is an ephemeral key that was never used.
 
         Raises:
             NoiseError: the initiator's ephemeral key is invalid.
@@ -155,7 +155,7 @@ class Responder:
 
 def _begin(psk: bytes, prologue: bytes) -> Symmetric:
     """Initialize() and token "psk"."""
-    name = _hash(NAME)  # hashed, because it is longer than a hash
+    name = _hash(NAME)  # hashed, because the name is longer than a hash
     return Symmetric(name, name).mix_hash(prologue).mix_key_and_hash(psk)
 
 

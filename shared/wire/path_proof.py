@@ -1,7 +1,7 @@
 """PATH, the message that names and proves a session's paths.
 
-`protocol` has its type number, and imports this module when such a message is sent or arrives;
-processes in real time import it before the first packet (`protocol.preload`).
+`protocol` has the type number of PATH, and imports this module when such a message is sent or
+arrives. Processes in real time import this module before the first packet (`protocol.preload`).
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ PRICE = range(1, 10**9)
 
 class PathProof(NamedTuple):
     """PATH: names the path over which it is sent. The server answers with a proof, and uses the
-    path once the client has returned the proof over it.
+    path once the client has sent the proof back over this path.
     """
 
     vehicle: int
@@ -24,10 +24,10 @@ class PathProof(NamedTuple):
     path: int
     """Number of the path, from 0."""
     proof: int
-    """Number that the server sends only to the address to be proven; 0 from a client that has not
-    received the number."""
+    """Number that the server sends only to the address to be proven, and that the client returns; 0
+    from a client that has not received it."""
     prices: tuple[int, ...]
-    """Price of a packet on each path of the session, in thousandths of the least."""
+    """Price of a packet on each path of the session, in thousandths of the lowest price."""
 
 
 def _prices(value: object, ours: Terms) -> tuple[int, ...]:  # noqa: ARG001

@@ -1,9 +1,9 @@
 """Several paths between a vehicle and its server: loss and delay of each path, and choice of the
 paths for each message.
 
-A message has one sequence number and one seal, and is sent over any set of paths. The first copy
-counts; later copies are equal byte for byte, so they are recognised before decryption. Each message
-is preceded by a loss report, sealed with it:
+A message is encrypted once, with one sequence number, and the same bytes are sent over one or more
+paths. The first copy counts; later copies are equal byte for byte, so they are recognised before
+decryption. Each message is preceded by a loss report, encrypted with the message:
 
     report = bin [sequence u16 | newest u16 | arrived u16, for each path]
 
@@ -13,14 +13,14 @@ each path in its own direction, and detects a dead path within a round trip.
 
 A message is sent over the set S of paths with the least expected cost,
 
-    Σ price_p + worth · Π q_p + alive · Π r_p           q_p: probability that it does not arrive
-        p in S           p in S         all p           r_p: that nothing sent on p arrives
+    Σ price_p + worth · Π q_p + alive · Π r_p       q_p: probability that a packet on p is lost
+        p in S           p in S         all p       r_p: probability that all packets on p are lost
 
 where `worth` is the cost of losing the message, in packets of price 1, and `alive` the cost if
 nothing arrives after the newest acknowledged packet. If many packets are in flight on one path, all
-of them may be lost at once, so the next message is sent over another. q_p is computed from the
-share of packets that path p loses, and from the probability that p is down, which rises by Bayes'
-rule with each packet in a row that has not arrived, and with the time without reports of the path.
+of them may be lost at once, so the next message is sent over another path. q_p is computed from the
+share of packets that path p loses, and from the probability that p is down. By Bayes' rule this
+probability rises with each packet lost in a row, and with the time since the last acknowledgement.
 """
 
 import math
@@ -37,8 +37,8 @@ from skytether.shared.wire.framing import BIN8, HEAD, PATHS_MAX, Report
 EVERYWHERE = 1e9
 """Value of `worth` with which a message is sent over every path."""
 SEQUENCES = 2**16
-"""Modulus of sequence numbers: half of it exceeds the number of packets in flight, so that even a
-very late packet is never mistaken for a newer one."""
+"""Modulus of sequence numbers. Half of the modulus exceeds the number of packets in flight, so that
+even a very late packet is not mistaken for a newer packet."""
 WINDOW = 16
 """Number of newest packets whose arrival is reported for each path."""
 COPIES = 32
@@ -51,7 +51,7 @@ DOWN, DOWN_EVERY_S = 0.05, 30.0
 DOWN_S = DOWN * DOWN_EVERY_S
 """Mean length of an outage [s]."""
 LOSS, LOSS_MIN, LOSS_WEIGHT = 0.05, 0.02, 1 / 32
-"""Loss ratio assumed initially, smallest loss ratio, and weight of a new packet."""
+"""Loss ratio: initial value, smallest value, and weight of a new packet in the mean."""
 OUTAGE = 3
 """Number of packets lost in a row that count as an outage, not as single losses."""
 DELAYS = 16
@@ -59,7 +59,7 @@ DELAYS = 16
 GAPS = 16
 """Number of newest intervals between messages of the other end that are stored."""
 LATE_PART = 8
-"""Inverse weight of the newest overtaken packet in the mean lateness of overtaken packets."""
+"""The newest overtaken packet has the weight 1 / LATE_PART in the mean lateness."""
 WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     600 * MILLISECOND_NS,
     150 * MILLISECOND_NS,
@@ -70,22 +70,22 @@ acknowledgement; later it is computed from measured delays, within WAIT_MIN_NS a
 SPARE_NS = 50 * MILLISECOND_NS
 """Margin added to measured delays before a packet counts as lost [ns]."""
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
-"""Times after which an unused path is probed, and a doubted path is probed again [ns]. A more
-expensive path is probed more rarely, in proportion to its price, at most by the factor DEAR_MAX."""
+"""Times after which an unused path is probed, and a doubted path is probed again [ns]. Both times
+are multiplied by the path's price, but at most by DEAR_MAX."""
 TRIES_MAX = 4
 """Largest number of times that the interval between probes is doubled, on a path that delivers
 packets of the other end but none of this end."""
 DOUBT = 0.5
-"""Probability that a packet on a path does not arrive, above which the path is doubted."""
+"""Probability of loss of the next packet on a path above which the path is doubted."""
 DEAD, DEAD_NS = 0.9, SECOND_NS
-"""Probability of loss, and time without an arrival [ns], above which a path is reported as dead,
-until the probability is at most DOUBT."""
+"""Probability of loss, and time without an arrival [ns]. A path that exceeds both is reported as
+dead, until the probability is at most DOUBT."""
 PATIENCE = 3
 """Largest factor on the interval between probes of a path that stays down."""
 ALIKE = 1.25
-"""Factor on the least expected cost up to which paths are used in turn."""
+"""Factor on the least expected cost; sets of paths with a cost up to this are used in turn."""
 ALIVE_WORTH = 40.0
-"""Cost, in packets, if the other end considers a working link lost."""
+"""Cost if the other end considers a working link lost [packets]."""
 _SETS = {
     count: [*chain.from_iterable(combinations(range(count), size) for size in range(1, count + 1))]
     for count in range(1, PATHS_MAX + 1)
@@ -154,7 +154,7 @@ class PathState:
 
         Args:
             under_way: number of packets in flight.
-            is_sent: whether another one is sent now; an outage may have ended since the last one.
+            is_sent: whether another packet is sent now, which may arrive after an outage's end.
         """
         down, loss = self._down(now_ns), self.loss
         if is_sent and self.used_ns is not None:
@@ -187,13 +187,13 @@ class PathState:
 
         Args:
             arrived: bits of the report for this path.
-            is_newest: whether no newer report has arrived; an older one does not show losses.
+            is_newest: whether no newer report has arrived; an older report does not show losses.
         """
         waiting, has_arrived = list(self.in_flight), False
         self.in_flight.clear()
         for packet in waiting:
             if _names(report, arrived, packet.sequence):
-                if packet.is_lost:  # it was not lost, but came late
+                if packet.is_lost:  # the packet was only late
                     self.delays_ns.clear()
                 self.delays_ns.append(now_ns - packet.sent_ns)
                 self._arrived(packet)
@@ -276,7 +276,7 @@ class Paths:
         self.peer_may_restart = False
         """Whether the other end may restart its sequence numbers."""
         self._before: int | None = None
-        """Newest sequence number before the other end restarted them; None if it has not."""
+        """Newest sequence number before the other end restarted its numbers, or None."""
         self._copies: dict[bytes, int] = {}
         """Sequence numbers of the newest datagrams of the other end, oldest first."""
 
@@ -294,8 +294,8 @@ class Paths:
         return bytes((BIN8, len(head) + len(masks))) + head + masks
 
     def choose(self, worth: float, now_ns: int, among: Sequence[int]) -> tuple[int, ...]:
-        """Paths for the next message; of sets with about equal cost, the set that was unused for
-        longest.
+        """Paths for the next message. If several sets of paths have about equal cost, the set that
+        was unused for longest.
 
         Args:
             worth: cost of losing the message, in packets on the cheapest path.
@@ -339,8 +339,8 @@ class Paths:
         ]
 
     def alive_worth(self, now_ns: int) -> float:
-        """Cost if nothing arrives, so that the other end considers the link lost after its
-        time-out.
+        """Cost if nothing arrives any more: after its time-out the other end considers the link
+        lost.
         """
         since_ns = self._arrived_ns()
         share = 1.0 if since_ns is None else max(now_ns - since_ns, 0) / self._timeout_ns
@@ -358,9 +358,9 @@ class Paths:
         """Note that a datagram with the newest report was sent.
 
         Args:
-            worth: cost of its loss, see `choose`; 0 for a heartbeat, which does not replace a
-                message that may have to be sent again.
-            is_probe: whether it only probes a path, so that it is not sent again.
+            worth: cost of losing the datagram, see `choose`; 0 for a heartbeat, which does not
+                replace a message that may have to be sent again.
+            is_probe: whether the datagram only probes a path; a probe is not sent again.
         """
         newest = self._newest
         if newest and _ahead(self._sequence, newest.sequence) >= WINDOW:
@@ -379,7 +379,7 @@ class Paths:
             path.bytes += len(datagram)
 
     def again(self, silence_ns: int, now_ns: int, among: Sequence[int]) -> tuple[bytes, int] | None:
-        """Newest datagram, and another path for sending it again now; None if it may still arrive.
+        """Newest datagram, and another path over which it must be sent again now; None: not now.
 
         Args:
             silence_ns: longest silence of the other end.
@@ -406,8 +406,8 @@ class Paths:
         return newest.datagram, best
 
     def looks(self, now_ns: int) -> list[int]:
-        """Paths on which a probe is due: paths not used for long, paths that are doubted or have
-        delivered nothing yet, and one for a report of a missing packet.
+        """Paths on which a probe is due: paths that were not used for long, are doubted, or have
+        delivered nothing yet; and the newest packet's path if a missing packet is to be reported.
         """
         due = []
         for one, path in enumerate(self.each):
@@ -419,7 +419,7 @@ class Paths:
             since_ns = path.looked_ns if doubted else path.used_ns
             wait_ns = (AGAIN_NS if doubted else LOOK_NS) * dear
             is_back = doubted and path.missing > 0 and path.has_brought
-            if is_back:  # it works again, or at least in the other direction
+            if is_back:  # the path works again, at least in the other direction
                 wait_ns = min(wait_ns, path.quick_ns << path.tries)
             if since_ns is None or now_ns - since_ns >= wait_ns:
                 path.looked_ns = now_ns
@@ -431,9 +431,9 @@ class Paths:
         return due
 
     def turned(self, now_ns: int) -> list[tuple[int, bool]]:
-        """Paths that have failed or work again since the last call, and whether each has failed.
+        """Paths that have failed or work again since the last call, and for each whether it failed.
 
-        A path over which no packet has arrived yet is omitted.
+        Paths over which no packet has arrived yet are omitted.
         """
         turned = []
         for one, path in enumerate(self.each):
@@ -480,12 +480,12 @@ class Paths:
         """Note an authentic datagram, and the packets that its report acknowledges.
 
         Args:
-            is_recent: whether its message proved to be recent; only then its report may be from a
-                new run of the other end, which has restarted its numbers.
+            is_recent: whether the datagram's message proved to be recent. Only then the report may
+                be from a new run of the other end, whose numbers begin anew.
 
         Raises:
-            ProtocolError: its report has another number of paths than this session, or it is older
-                than WINDOW packets and its message did not prove to be recent.
+            ProtocolError: the report has another number of paths than this session; or it is older
+                than WINDOW packets and `is_recent` is False.
         """
         if len(report.arrived) != len(self.each):
             raise ProtocolError(Drop.FIELD)
@@ -520,8 +520,8 @@ class Paths:
             self._newest = None
 
     def _progress(self, sequence: int, *, is_recent: bool) -> int:
-        """Number of packets by which a packet is ahead of the newest received one; WINDOW if it is
-        the first, -WINDOW if it is from the other end's earlier run.
+        """Number of packets by which a packet is ahead of the newest received packet. WINDOW: it is
+        the first packet; -WINDOW: it is from the other end's earlier run.
         """
         ahead = WINDOW if self._heard is None else _ahead(sequence, self._heard)
         if self.peer_may_restart and is_recent and ahead <= -WINDOW:

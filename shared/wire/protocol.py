@@ -10,10 +10,10 @@ Each message is a class below; `docs/protocol.md` describes its bytes. With the 
     number      number of packets that the sender sent earlier in the session, modulo NUMBERS
     silence     longest silence that the sender allows the other end [half steps]; 0 for no bound
 
-A state is sampled at the start of its step, so the step number is also its time stamp. Other time
-stamps are in microseconds modulo 2^32 (71 minutes); the receiver adds the multiple of 2^32 with
-which the time is nearest to the expected one. A datagram that is not exactly one of these messages
-is an error of the peer (`ProtocolError`): dropped, counted by its reason, and never answered.
+A state is sampled at the start of its step, so the step number is also the state's time stamp.
+Other time stamps are in microseconds modulo 2^32 (71 minutes); the receiver adds the multiple of
+2^32 that is nearest to the expected time. A datagram that is not exactly one of these messages is
+an error of the peer (`ProtocolError`). It is dropped, counted by reason, and never answered.
 """
 
 import math
@@ -36,10 +36,10 @@ from skytether.shared.law.model import Array
 from skytether.shared.law.terms import Terms
 from skytether.shared.wire.drop import Drop, ProtocolError
 
-# Below 0x80, so that msgpack writes it in one byte: `kind_of` and the quick decoder rely on that.
+# Below 0x80, so that msgpack writes the version as one byte, as `kind_of` and `_QUICK` require.
 VERSION = 1
 PAYLOAD_BYTES_MAX = 1200
-"""Size up to which no datagram is fragmented: two fragments turn 10 % loss into 19 %."""
+"""Size up to which no datagram is fragmented [B]. Two fragments would turn 10 % loss into 19 %."""
 
 AXES_MAX = 3
 TEXT_MAX = 32
@@ -47,7 +47,7 @@ INPUTS_MAX = 270
 """Largest number of inputs of all axes in one horizon, limited by the packet size."""
 KNOTS_MAX = 16
 STAMPS = 2**32
-"""Modulus of time stamps [µs]: 71 minutes."""
+"""Modulus of time stamps [µs]; 2^32 µs are 71 minutes."""
 
 REFERENCE_P, REFERENCE_V, DISTURBANCE, GAIN_P, GAIN_V = range(5)
 """Columns of `Horizon.feedback`: position [m] and velocity [m/s] of x̄ at the horizon's step, the
@@ -93,7 +93,7 @@ class Welcome(NamedTuple):
     session: int
     """Number of the session; 0 for a refusal."""
     boot_id: int
-    """Boot id of the HELLO: an answer to another run of the client is dropped."""
+    """Boot id from the HELLO; a client drops answers to an earlier run of itself."""
     server_boot_id: int
     server_ns: int
     refusal: int
@@ -121,9 +121,9 @@ class Mode(IntEnum):
     FAULT = 8
     """Has a fault: holds the position, and ignores horizons."""
     MANUAL = 9
-    """Flown by a pilot, or by nobody: nothing is sent to the autopilot."""
+    """A pilot flies, or nobody does: nothing is sent to the autopilot."""
     RETURN = 10
-    """Flown home and landed by its autopilot."""
+    """The autopilot flies the vehicle home and lands it."""
 
     def __str__(self) -> str:
         return self.name.lower()
@@ -137,12 +137,12 @@ class Observation(NamedTuple):
     step: int
     """Step k at whose start the state was sampled, on the vehicle's grid."""
     in_force: int
-    """Step that the horizon in force was made for, or NO_HORIZON."""
+    """Step for which the horizon in force was made, or NO_HORIZON."""
     since: int
     """First step that was flown with the horizon in force."""
     backward_us: int
-    """Time stamp: arrival of the server's newest packet, in time since the vehicle's step 0, minus
-    the server's clock when the packet was sent."""
+    """Time stamp: time from the vehicle's step 0 to the arrival of the server's newest packet,
+    minus the server's clock when this packet was sent."""
     heard: int
     """Number of packets of the server that have arrived, modulo NUMBERS."""
     mode: int
@@ -156,12 +156,12 @@ class Observation(NamedTuple):
     number: int = 0
     silence: int = 0
     unsaved: int = 0
-    """1 if a restarted client could not continue this flight, because its state cannot be saved,
-    else 0."""
+    """1 if the client's state cannot be saved, so that a restarted client could not continue the
+    flight; else 0."""
 
 
 class Horizon(NamedTuple):
-    """Control horizon U(k) of eq. (8), after the committed inputs if there are any."""
+    """Control horizon U(k) of eq. (8), preceded by the committed inputs if there are any."""
 
     vehicle: int
     session: int
@@ -170,7 +170,7 @@ class Horizon(NamedTuple):
     server_us: int
     age: int
     inputs: NDArray[np.float32]
-    """Desired velocity [m/s]; shape (axes, d + H), d committed ones first, 0 … `ahead_max`."""
+    """Desired velocity [m/s]; shape (axes, d + H). The first d, 0 … `ahead_max`, are committed."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """Parameters of the feedback aboard, in the columns REFERENCE_P … GAIN_V; shape (axes,
     FEEDBACK), or (axes, 0) without feedback."""
@@ -205,7 +205,7 @@ class Idle(IntEnum):
     text: str
 
     PLANS = 0, "no newer horizon has arrived"
-    # The observation is too old, or would be at the start of a plan.
+    # The observation is too old, or would be too old when a plan starts.
     OBSERVATION = 1, "its newest observation at the server is older than link.age_max_s"
     DELAY = 2, "the delay to it is longer than a horizon can cover"
     UNSOLVED = 3, "the solver has found no plan"
@@ -234,7 +234,7 @@ class Close(NamedTuple):
 
 
 class Time(NamedTuple):
-    """Time of day at which a vehicle's step 0 began; sent if it is known on the vehicle's host."""
+    """Time of day at which a vehicle's step 0 began; sent if the vehicle's host knows the time."""
 
     vehicle: int
     session: int
@@ -246,24 +246,24 @@ class Time(NamedTuple):
     """Largest error of `epoch_us` [µs]."""
 
 
-# With 10 % loss, all three are lost in one of a thousand cases.
+# With 10 % loss, all three packets are lost in one of a thousand cases.
 CLOSES = 3
 
 
 def stamp_us(time_ns: int) -> int:
     """Time stamp of a time, or of a difference of two clocks: whole microseconds modulo STAMPS."""
-    # Python's % is never negative, so a negative difference of two clocks has a stamp as well.
+    # Python's % is never negative, so negative differences of clocks have stamps, too.
     return time_ns // MICROSECOND_NS % STAMPS
 
 
 def stamped_ns(stamp: int, near_ns: int) -> int:
     """Time with a given stamp that is nearest to `near_ns` [ns].
 
-    It is exact to a microsecond if `near_ns` is exact to half an hour.
+    The result is exact to a microsecond if the error of `near_ns` is less than half an hour.
     """
     near = near_ns // MICROSECOND_NS
     half = STAMPS // 2
-    # Signed distance of the stamp from the expected one, from -half to half - 1.
+    # Signed distance of the stamp from the expected stamp, from -half to half - 1.
     return (near + (stamp - near + half) % STAMPS - half) * MICROSECOND_NS
 
 
@@ -283,7 +283,7 @@ Message = (
 
 
 class OrNone(NamedTuple):
-    """Check of a field that is empty or an integer of a range."""
+    """Check of a field that is either None or an integer of a range."""
 
     integers: range
 
@@ -311,7 +311,7 @@ def _terms(value: object, ours: Terms) -> Terms:
     if type(value) is not tuple or len(value) != len(ours):
         raise ProtocolError(Drop.FIELD)
     for theirs, our in zip(value, ours, strict=True):
-        # Exact types: otherwise True would pass for 1, and 1 for 1.0.
+        # Types must be exact: otherwise True would pass for 1, and 1 for 1.0.
         if type(theirs) is not type(our) or not is_plain(theirs):
             raise ProtocolError(Drop.FIELD)
     return Terms._make(value)
@@ -338,7 +338,7 @@ def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
         raise ProtocolError(Drop.SHAPE)
     # Struct takes 0.2 µs for six numbers, np.frombuffer and tolist 0.7 µs.
     numbers = layout.unpack(value)
-    # The sum of float32 numbers is finite unless one of them is not.
+    # The sum of float32 numbers is finite if and only if all of them are.
     if not math.isfinite(sum(numbers)):
         raise ProtocolError(Drop.NOT_FINITE)
     # zip with `strict` takes twice as long. Along splines there are no inputs.
@@ -384,12 +384,12 @@ def knots_in(value: object, ours: Terms) -> NDArray[np.float32]:
 
 
 def ahead_max(terms: Terms) -> int:
-    """Largest delay bound d with which d inputs and a plan fit in a horizon [steps]; at least 1."""
+    """Largest delay bound d with which d + H inputs fit in a packet [steps]; at least 1."""
     return max(1, min(INPUTS_MAX // terms.axes - terms.horizon, terms.age_max))
 
 
 def _array(value: object, dtype: np.dtype[Any], axes: int, counts: tuple[int, int]) -> NDArray[Any]:
-    """Array of `axes` rows, with a number of columns within `counts`."""
+    """Array of `axes` rows; the number of columns must be in `counts`."""
     if type(value) is not bytes:
         raise ProtocolError(Drop.SHAPE)
     count, rest = divmod(len(value), axes * dtype.itemsize)
@@ -408,8 +408,8 @@ U64 = range(2**64)
 _CLOCK = range(2**63)
 _STAMP = range(STAMPS)
 _NUMBER = range(NUMBERS)
-# Negative if the server's clock was set and its clock map lags: then the step is before that of the
-# observation.
+# An age is negative if the step is before the observation's step, as after the server's clock was
+# set, until its clock map has followed.
 _AGE = range(-(2**15), 2**32)
 _SPACING = range(1, 2**16)
 _DOES = 2 * len(Mode)
@@ -447,8 +447,8 @@ def _kind(check: Check) -> Any:
 
 
 _QUICK = msgspec.msgpack.Decoder(tuple[int, int, *map(_kind, _FIELDS)])  # type: ignore[misc]
-"""Decoder of an observation that checks types and ranges at once. A packet that it refuses is
-decoded again field by field to find the reason."""
+"""Decoder of an observation that checks types and ranges at once. A packet that this decoder
+refuses is decoded again field by field to find the reason."""
 _MADE = [(i, check) for i, check in enumerate(_FIELDS) if callable(check)]
 """Converters of the fields of an observation that are sent as bytes, by field index."""
 # 0x90 + n is msgpack's header of an array of n < 16 elements.
@@ -462,7 +462,7 @@ def add(number: int, message: type[Any], checks: tuple[Check, ...]) -> None:
     _TYPES[number], _NUMBERS[message] = (message, checks), number
 
 
-# One packer for all messages: packb makes one per message, and takes three times as long.
+# One packer for all messages: packb makes a packer per message, and takes three times as long.
 _PACKER = msgpack.Packer(default=np.ndarray.tobytes)
 
 
@@ -493,7 +493,7 @@ def _observation(fields: Iterable[Any]) -> Observation:
     vehicle, session, step, flown, delay, backward_us, heard, does, motion, number, silence = fields
     since = step - flown
     in_force = NO_HORIZON if delay is None else since - delay
-    # The sum of differences may be below step 0 even if each is within its range.
+    # Each difference is within its range, but the step computed from them may be below 0.
     if since < 0 or (delay is not None and in_force < 0):
         raise ProtocolError(Drop.FIELD)
     unsaved, does = divmod(does, _DOES)
@@ -585,7 +585,7 @@ def unpacked(payload: bytes) -> tuple[Any, ...]:
     Raises:
         ProtocolError: the bytes are not one msgpack array of two elements or more.
     """
-    # The first check: a packet that is too long is not parsed at all.
+    # This check is the first, so that a packet that is too long is not parsed at all.
     if len(payload) > PAYLOAD_BYTES_MAX:
         raise ProtocolError(Drop.TOO_LONG)
     try:
