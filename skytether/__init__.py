@@ -5,8 +5,8 @@
     flight = skytether.fly("demo", duration=20)
     print(flight.summary.rmse_xy)
 
-`docs/python.md` describes the library, which is the names in `__all__`; a name is imported when it
-is first used, so that `import skytether` is fast.
+`docs/python.md` describes the library. The library has the names in `__all__`; a name is imported
+when it is first used, so that `import skytether` is fast.
 """
 
 from importlib import import_module

@@ -29,7 +29,7 @@ BIND = "127.0.0.1:14550"
 @dataclass(frozen=True)
 class AutopilotOptions(ProcessOptions):
     scenario: ScenarioName = "demo"
-    """A scenario's name (`skytether list scenarios`) or a .toml file, of which only
+    """A scenario's name (`skytether list scenarios`) or a .toml file. Only its keys
     `vehicle.frame`, `vehicle.battery`, `vehicle.steady_wind_mps`, `vehicle.turbulence_mps` and
     `seed` are used."""
     flavour: FlavourName = "ardupilot"
@@ -39,8 +39,8 @@ class AutopilotOptions(ProcessOptions):
     autopilot answers each sender.
     """
     to: str | None = None
-    """HOST:PORT to send heartbeats to from the start, for a companion computer that waits for the
-    autopilot to speak first: 127.0.0.1:14540 for PX4.
+    """HOST:PORT to which heartbeats are sent from the start, for a companion computer that waits
+    for the autopilot's first packet: 127.0.0.1:14540 for PX4.
     """
     ready: Annotated[float | None, Argument(metavar="SECONDS")] = None
     """Time from the start until the vehicle may be armed [s]; by default 41.5 for ArduCopter and
@@ -55,23 +55,23 @@ class AutopilotOptions(ProcessOptions):
             "silence@20-25: the autopilot sends nothing for 5 s; pilot@20: a pilot takes over; "
             "disarm@20: its rotors stop; battery@20: 5 percent of the charge are left; "
             "estimate@20-25: it has no position estimate; "
-            "drift@20-25: its accelerometers fail, it drifts and its estimate does not; "
+            "drift@20-25: its accelerometers fail, it drifts, but its estimate stays; "
             "commander@20-25: a second station commands 3 m/s north, 50 times a second; "
             "leap@20: the position that it reports leaps by 12 m; "
             "shift@20: its receiver's position shifts by 3 m; fix@20: its receiver has no fix.",
         ),
     ] = ()
     insecure: bool = False
-    """Listen even where other machines can reach it: MAVLink has no keys, so anybody can then fly
-    the vehicle.
+    """Listen at an address that other machines can reach, too. MAVLink has no keys, so anybody can
+    then fly the vehicle.
     """
 
 
 def pilot(argv: Sequence[str]) -> None:
     """Simulate a vehicle with an autopilot that speaks MAVLink, until SIGINT or SIGTERM.
 
-    It responds to velocities, lost set-points, commands and parameters as measured on ArduCopter or
-    PX4, around a simulated quadrotor. SIGUSR1 prints the counters so far.
+    A simulated quadrotor responds to velocities, lost set-points, commands and parameters as was
+    measured on ArduCopter or PX4. SIGUSR1 prints the counters so far.
     """
     options = command.parse(AutopilotOptions(), argv, "skytether autopilot", pilot.__doc__)
     if options.ready is not None and not 0.0 <= options.ready <= 3600.0:

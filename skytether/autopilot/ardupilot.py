@@ -1,4 +1,4 @@
-"""ArduCopter 4.5, as measured: it stops when set-points stop, and stays in GUIDED."""
+"""ArduCopter 4.5, as measured: without set-points the vehicle stops, and stays in GUIDED."""
 
 from math import hypot
 
@@ -14,7 +14,7 @@ from skytether.quadrotor.loops import Gains
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
-"""Lower bound of every gain and limit, also if the parameter is smaller."""
+"""Lower bound of every gain and limit; a smaller parameter is raised to it."""
 LANDED_S = 2.0
 """Time on the ground after which a landing counts as finished [s], as measured."""
 STATION_ACTIONS = {
@@ -61,7 +61,7 @@ class ArduPilot(PilotedVehicle):
         return self.mode is FlightMode.GUIDED
 
     def altitude_of(self, altitude: float) -> float | None:
-        """Altitude above home [m]: the commanded one, which counts from home already."""
+        """Altitude above home [m]: the commanded altitude, which ArduCopter counts from home."""
         return altitude
 
     def enter_takeoff(self) -> bool:
@@ -101,7 +101,7 @@ class ArduPilot(PilotedVehicle):
         return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """Brake after GUID_TIMEOUT without set-points, if the vehicle moves."""
+        """Whether to brake: no set-point has come for GUID_TIMEOUT."""
         past_s = (self.now_ns - setpoint.came_ns) / SECOND_NS
         return past_s > self.parameters["GUID_TIMEOUT"]
 

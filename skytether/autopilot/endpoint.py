@@ -36,7 +36,7 @@ from skytether.shared.telemetry.record import Recorder
 SYSTEM, COMPONENT = 1, int(dialect.MAV_COMP_ID_AUTOPILOT1)
 """System and component id of the autopilot."""
 PEERS_MAX = 8
-"""Largest number of peers at once; a new one replaces the one that was silent longest."""
+"""Largest number of peers at once; a new peer replaces the peer that was silent longest."""
 PATIENCE_NS = SECOND_NS
 """Silence after which a peer may be replaced [ns]."""
 BEHIND_MAX_NS = SECOND_NS
@@ -46,7 +46,7 @@ FORCE = 21196.0
 
 TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
     [
-        ("time_ns", "<i8"),  # [the autopilot's clock]
+        ("time_ns", "<i8"),  # time on the autopilot's clock
         ("state", "<f8", (3, 2)),  # true position [m] and velocity [m/s]
     ]
 )
@@ -54,7 +54,7 @@ TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
 
 PILOTS: dict[FlavourName, type[PilotedVehicle]] = {"ardupilot": ArduPilot, "px4": PX4}
 POSITION_IGNORED, VELOCITY_IGNORED = 0b111, 0b111000
-"""Bits of a set-point's type mask; those of acceleration are 0b111000000."""
+"""Bits of a set-point's type mask that mean: ignore position, ignore velocity."""
 ACCELERATION_IGNORED = 0b111000000
 
 
@@ -80,12 +80,12 @@ class Peer:
             self.streams[number] = round(SECOND_NS / rate), now_ns
 
     def every(self, number: int, interval_ns: int, now_ns: int) -> None:
-        """Start a stream: send a message at an interval, at most once per tick."""
+        """Start to send a message at an interval, at most once per tick."""
         interval_ns = max(interval_ns, TICK_NS)
         self.streams[number] = interval_ns, now_ns + interval_ns
 
     def due(self, now_ns: int) -> list[int]:
-        """Messages that are due now; each is scheduled again."""
+        """Ids of the messages that are due now; each message is scheduled again."""
         numbers = [number for number, (_, next_ns) in self.streams.items() if next_ns <= now_ns]
         for number in numbers:
             interval_ns, next_ns = self.streams[number]
@@ -97,8 +97,8 @@ class Autopilot(Endpoint):
     """Simulated vehicle that speaks MAVLink.
 
     Args:
-        scenario: scenario, of which frame, battery, wind and seed are used.
-        peers: addresses that it sends to from the start.
+        scenario: only its frame, battery, wind and seed are used.
+        peers: addresses to which the vehicle sends from the start.
         ready_s: time until the vehicle may be armed; None for the flavour's default.
         recorder: takes the true state at each tick, as rows of TRUTH_COLUMNS.
     """

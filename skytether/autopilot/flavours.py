@@ -20,7 +20,7 @@ class FlightMode(Enum):
     """Mode of the vehicle, under a name common to both autopilots."""
 
     PILOT = auto()
-    """Flown by a pilot; with centred sticks the vehicle holds its position."""
+    """A pilot flies; with centred sticks the vehicle holds its position."""
     HOLD = auto()
     """The vehicle brakes, then holds its position."""
     GUIDED = auto()
@@ -47,9 +47,9 @@ class SimulatedFlavour:
     frame: str
     """Airframe of the autopilot's own simulator, or the nearest one in FRAMES."""
     ready_s: float
-    """Time from the start until arming is allowed [s], because filters must settle first."""
+    """Time from the start until arming is allowed [s]; the autopilot's filters settle meanwhile."""
     words_for_stations: bool
-    """Whether status texts are sent only to ground stations, as by PX4."""
+    """Whether status texts are sent only to ground stations, as PX4 does."""
     fixed_heartbeats: bool
     """Whether the rate of the autopilot's heartbeats is fixed."""
     stamps_fixes: bool
@@ -82,7 +82,7 @@ def _px4(main: int, sub: int = 0) -> int:
 
 LOCAL_POSITION = int(dialect.MAVLINK_MSG_ID_LOCAL_POSITION_NED)
 CURRENT_MODE = 436
-"""Number of CURRENT_MODE, which PX4 sends and the dialect lacks."""
+"""Message id of CURRENT_MODE. PX4 sends this message, but pymavlink's dialect lacks it."""
 FLAVOURS: dict[FlavourName, SimulatedFlavour] = {
     "ardupilot": SimulatedFlavour(
         title="ArduCopter",

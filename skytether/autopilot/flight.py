@@ -1,8 +1,8 @@
 """Flight of a simulated autopilot: arming, modes, the motion in each mode, and failsafes.
 
-Both flavours share this module; their differences are in `ardupilot.py` and `px4.py`. Positions are
-x north, y east, altitude up, relative to the start. Times are those of the autopilot's own clock
-[ns], which begins at 0.
+ArduCopter and PX4 share this module; their differences are in `ardupilot.py` and `px4.py`.
+Positions are x north, y east, altitude up, relative to the start. Times are on the autopilot's own
+clock [ns], which begins at 0.
 """
 
 from abc import ABC, abstractmethod
@@ -32,15 +32,15 @@ STILL_MPS = 0.1
 WANDER_NS = 3 * SECOND_NS
 """Correlation time of the error of the velocity estimate [ns]."""
 WANDER_TIME_S = 0.6
-"""Position estimate's error divided by the velocity estimate's error [s]."""
+"""Ratio of the position estimate's error to the velocity estimate's error [s]."""
 FIX_TICKS = 40
-"""Age of a GPS fix when it is reported, in ticks."""
+"""Age of a GPS fix when it is reported [ticks]."""
 PULL, PULL_MPS, PULL_FADES = 0.45, 0.35, 0.8
-"""Gains of the estimate after a shift of the receiver's position: from position error to position
-rate [1/s] and velocity rate [1/s²], and decay of the velocity error [1/s]. Fitted to ArduCopter
-4.5.6 after a shift of 3 m."""
+"""Gains with which the estimate follows a shift of the receiver's position: from position error to
+the rate of the position [1/s] and of the velocity [1/s²], and decay of the velocity error [1/s].
+They are fitted to ArduCopter 4.5.6 after a shift of 3 m."""
 BLIND_MPS2 = 0.03
-"""Error of the acceleration on each axis, which moves the estimate while there is no fix [m/s²]."""
+"""Acceleration error on each axis, with which the estimate drifts without a fix [m/s²]."""
 
 Vector = tuple[float, float, float]
 REST: Vector = (0.0, 0.0, 0.0)
@@ -69,14 +69,14 @@ class Landed(Enum):
 
 class CompanionSetpoint(NamedTuple):
     velocity: Vector
-    """Velocity; the feed-forward velocity if there is a position [m/s]."""
+    """Velocity [m/s]; if there is a position, the feed-forward velocity."""
     position: Vector | None
     """Position [m]; None if only the velocity is set."""
     came_ns: int
 
 
 class OwnSpeeds(NamedTuple):
-    """Limits and gains in modes that follow no set-points."""
+    """Limits and gains of motions that the autopilot plans itself, without set-points."""
 
     speed: float
     up: float
@@ -118,11 +118,11 @@ class PilotedVehicle(ABC):
         self.armed_ns: int | None = None
         self.flying = False
         self.estimates = True
-        """Whether the position estimate works; it is not yet valid during `ready_s`."""
+        """Whether the position estimate works. During `ready_s` the estimate is not valid yet."""
         self.drift: Vector = REST
-        """True velocity minus the estimated one, as after a failure of the accelerometers [m/s]."""
+        """True minus estimated velocity, as after a failure of the accelerometers [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
-        """True velocity minus the velocity estimate, apart from `drift` [m/s]."""
+        """Random part of the true velocity minus the estimated velocity [m/s]."""
         self.displaced: Vector = REST
         self.fixes = True
         """Whether the receiver has a fix."""
@@ -137,7 +137,7 @@ class PilotedVehicle(ABC):
         self.said: list[tuple[Severity, str]] = []
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the ground station's newest heartbeat [ns]; None before one: no failsafe."""
+        """Time of the ground station's newest heartbeat [ns]; None before: no failsafe then."""
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
@@ -287,7 +287,7 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def altitude_of(self, altitude: float) -> float | None:
-        """Altitude above home for a commanded altitude [m]; None for an invalid one."""
+        """Altitude above home for a commanded altitude [m]; None if the command is invalid."""
 
     @abstractmethod
     def enter_takeoff(self) -> bool:
@@ -305,11 +305,11 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def return_altitude(self, distance: float) -> float:
-        """Altitude of the flight home from a distance [m]."""
+        """Altitude of the flight home, from the distance to home [both m]."""
 
     @abstractmethod
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """If set-points have stopped, trigger the failsafe that the parameters choose."""
+        """Whether set-points have stopped; if so, trigger the failsafe that parameters choose."""
 
     @abstractmethod
     def watch(self) -> None:
@@ -505,7 +505,7 @@ class PilotedVehicle(ABC):
 
 
 def _approach(distance: float, p: float, acceleration: float) -> float:
-    """Speed towards a target [m/s]: proportional to the distance, or to its root if it is large."""
+    """Speed towards a target [m/s]: proportional to a small distance, or to a large one's root."""
     near = acceleration / (p * p)
     if distance <= near:
         return p * distance

@@ -1,7 +1,7 @@
-"""PX4 1.17, as measured: when set-points stop, it leaves OFFBOARD and flies home.
+"""PX4 1.17, as measured: when set-points stop, PX4 leaves OFFBOARD and flies home.
 
 A failsafe replaces the requested mode only temporarily: when set-points come again, PX4 returns to
-OFFBOARD by itself. After disarming it is in the newest requested mode that allows arming, such as
+OFFBOARD by itself. After disarming, PX4 is in the newest requested mode that allows arming, such as
 OFFBOARD after a landing.
 """
 
@@ -24,11 +24,11 @@ from skytether.quadrotor.quadrotor import Quadrotor
 from skytether.shared.base.units import SECOND_NS
 
 LEAST = 0.1
-"""Lower bound of every gain, also if the parameter is smaller."""
+"""Lower bound of every gain; a smaller parameter is raised to it."""
 SILENCE_LAG_S = 0.2
 """Time from the end of COM_OF_LOSS_T until PX4 acts [s], as measured."""
 OFFBOARD_ACTIONS = {4: FlightMode.LAND, 5: FlightMode.HOLD}
-"""Modes by the value of COM_OBL_RC_ACT; all others mean RETURN without a remote control."""
+"""Modes by the value of COM_OBL_RC_ACT; without a remote control, other values mean RETURN."""
 STATION_ACTIONS = {1: FlightMode.HOLD, 2: FlightMode.RETURN, 3: FlightMode.LAND}
 """Modes by the value of NAV_DLL_ACT."""
 BATTERY_ACTIONS = {2: FlightMode.LAND, 3: FlightMode.RETURN}
@@ -105,7 +105,7 @@ class PX4(PilotedVehicle):
         return True
 
     def altitude_of(self, altitude: float) -> float | None:
-        """Altitude above home [m], from one above the sea; if that is NaN, MIS_TAKEOFF_ALT."""
+        """Altitude above home [m], from an altitude above the sea; for NaN, MIS_TAKEOFF_ALT."""
         if isfinite(altitude):
             return altitude - self.flavour.home[2]
         return self.parameters["MIS_TAKEOFF_ALT"]

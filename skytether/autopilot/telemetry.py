@@ -88,7 +88,7 @@ class Telemetry:
         )
 
     def gps(self) -> Message:
-        """GPS fix; reports no fix until the estimate is ready."""
+        """GPS fix; without a fix until the estimate is ready."""
         flight = self._flight
         has_fix = flight.ready and flight.fixes
         fix = dialect.GPS_FIX_TYPE_3D_FIX if has_fix else dialect.GPS_FIX_TYPE_NO_FIX
@@ -144,7 +144,7 @@ class Telemetry:
         )
 
     def battery_status(self) -> Message:
-        """Battery state, sent as that of one cell."""
+        """Battery state, sent as if the battery had one cell."""
         battery = self._flight.quadrotor.battery()
         voltages = [round(1000.0 * battery.voltage)] + [UNKNOWN_MV] * 9
         return dialect.MAVLink_battery_status_message(

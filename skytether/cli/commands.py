@@ -129,7 +129,7 @@ KINDS = (
     *("scenarios", "triggers", "reports", "schemes"),
     *("planners", "references", "impairments", "vehicles"),
 )
-"""Kinds that `skytether list` accepts; written out, because importing the tables is slow."""
+"""Kinds that `skytether list` accepts. They are written out, because importing tables is slow."""
 ELSEWHERE = {
     **{kind: f"skytether list {kind}" for kind in KINDS},
     "torture": "python -m fuzz.torture, in a checkout",
@@ -138,7 +138,7 @@ ELSEWHERE = {
     "crowd": "python -m bench.crowd, in a checkout",
     "envelope": "skytether sweep",
 }
-"""Replacement of each former command, by its name."""
+"""Replacement of each former command, by the former name."""
 
 
 def usage() -> str:

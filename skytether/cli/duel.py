@@ -51,8 +51,8 @@ class DuelOptions:
 def duel(argv: Sequence[str]) -> None:
     """Fly scenarios side by side, and show them on one page.
 
-    All have the same network, wind and seed; a change on the page applies to all. Ctrl-C ends the
-    flights.
+    All flights have the same network, wind and seed; a change on the page applies to all flights.
+    Ctrl-C ends the flights.
     """
     options = read(DuelOptions(tyro.MISSING), argv, "skytether duel", duel.__doc__)
     at = command.address("--page", options.page)

@@ -32,8 +32,8 @@ class ExportOptions:
     `trace(FILE)` replays; see docs/network.md.
     """
     pcap: Path | None = None
-    """File for a packet capture (pcap) of netem's output: made-up headers, true lengths, no
-    payload.
+    """File for a packet capture (pcap) of netem's output, with true lengths, but made-up headers
+    and no payload.
     """
     plugin: command.Plugins = ()
 

@@ -38,11 +38,11 @@ from skytether.shell.commandline.command import CommandError, ScenarioName, Scen
 from skytether.sim import flight as sim
 
 VEHICLES = 20
-"""Number of vehicles of a fleet without a mission, unless --vehicles is given."""
+"""Default of --vehicles without a mission."""
 AFTER_S = 30.0
 """Time flown after the last goal of a mission's table [s]."""
 STAGES = ("receive", "open", "decode", "observe", "estimate", "plan", "trigger", "encode", "send")
-"""Stages of the server's work in a tick, in order, without that of recording."""
+"""Stages of the server's work in a tick, in order, except recording."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +65,8 @@ class FleetOptions(ScenarioOptions):
     virtual: bool = False
     """Fly in virtual time: everything in one process, as fast as possible."""
     page: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
-    """HOST:PORT of a page with all vehicles, as in `skytether fly`; by default none, because
-    `fleet` measures CPU time, and a page uses CPU time. Not in virtual time.
+    """HOST:PORT of a page with all vehicles, as in `skytether fly`. By default there is no page,
+    because a page uses CPU time, and `fleet` measures CPU time. Not in virtual time.
     """
     json: Path | None = None
     """File for the summary of the flight."""
@@ -91,7 +91,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     uplink_above: int | None
     """Plans sent because the trigger's figure was above its threshold; in virtual time only."""
     uplink_due: int | None
-    """Plans sent as a heartbeat, by a schedule, or as the first one; in virtual time only."""
+    """Plans sent as a heartbeat, by a schedule, or as the first plan; in virtual time only."""
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
     separation_m: float | None
@@ -99,7 +99,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
     left_tube: int | None
-    """Observations outside a tube (`mission.tube_m`); the separation is proven only if it is 0."""
+    """Observations outside a tube (`mission.tube_m`); if any, the separation is not proven."""
     uplink_packets_per_s: float
     """Packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
@@ -123,11 +123,11 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     client_late_ms_max: float
     """Longest delay with which a vehicle's step began [ms]."""
     machine_missed: int | None
-    """Steps missed by a thread that only sleeps meanwhile: those missed because of the machine."""
+    """Steps that a sleeping thread missed meanwhile, which shows how many the machine caused."""
     machine_late_ms_max: float | None
     """Longest delay with which the sleeping thread woke [ms]."""
     server_cpu_us: dict[str, float]
-    """Time of the server per vehicle and step [µs]: CPU time `total`, wall-clock time by stage."""
+    """Server's time per vehicle and step [µs]: `total` is CPU time, stages are wall-clock time."""
     client_cpu_us: float | None
     """CPU time of the vehicles' process per vehicle and step [µs]."""
     netem_cpu_us: float | None
@@ -148,8 +148,8 @@ def fleet(argv: Sequence[str]) -> None:
     """Fly many vehicles on one server, each over its own network.
 
     Server, netem and all vehicles run as three processes on loopback, or in virtual time in one
-    process. It shows the server's CPU time per vehicle and step. Ctrl-C ends the flight and still
-    shows the results so far.
+    process. The results show the server's CPU time per vehicle and step. Ctrl-C ends the flight and
+    still shows the results so far.
     """
     argv = _with_mission(argv)
     options = command.parse(FleetOptions(), argv, "skytether fleet", fleet.__doc__)
@@ -291,8 +291,8 @@ class Lateness:
 
 @contextmanager
 def metronome(dt_s: float) -> Iterator[Lateness]:
-    """Run a thread that only sleeps, from step to step of `dt_s`, during the block; the steps that
-    it misses were missed because of the machine.
+    """Run a thread during the block that only sleeps from step to step of `dt_s`. A step that it
+    misses was missed because of the machine, not because of our code.
     """
     late, over = Lateness(), threading.Event()
 

@@ -50,11 +50,11 @@ PRINTED = (
 )
 """Events that are printed during the flight."""
 PRINTED_OF_ROOMS = ("LeaderChanged",)
-"""Names of further printed events, whose packages need not be installed."""
+"""Names of further printed events; their packages need not be installed."""
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked while the page stays open [s]."""
 Flown = tuple[Scenario, "Future[Record]"]
-"""Scenario of --beside, and the record of its flight once another process has flown it."""
+"""Scenario of --beside, and the future record of its flight, which another process flies."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
 """Modes before the first plan is flown; their changes are not printed."""
 
@@ -71,7 +71,7 @@ class FlyOptions(ScenarioOptions):
     virtual: bool = False
     """Fly in virtual time: the same code in one process, reproducible, many times faster."""
     set_parameters: bool = False
-    """Make the parameters of the autopilot safe for the case that set-points stop. Without
+    """Set the autopilot's parameters to values that are safe if set-points stop. Without
     --set-parameters, unsafe values are only reported, and the vehicle is not armed.
     """
     control: Path | None = None
@@ -129,7 +129,7 @@ def fly(argv: Sequence[str]) -> None:
     if not options.virtual:
         for warning in command.flight_warnings(scenario):
             page_process.say(warning)
-    # Compiles the vehicle's kernels, and fails before any process starts if there is no vehicle.
+    # This compiles the vehicle's kernels; without a vehicle it fails before any process starts.
     vehicles.make(scenario, 0)
     at = options.page or os.environ.get(page_process.VARIABLE, HOST_PORT)
     page = None if options.virtual or options.no_page else at

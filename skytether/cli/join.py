@@ -18,8 +18,8 @@ from skytether.view.recordings.joining import join as joined
 @dataclass(frozen=True)
 class JoinOptions:
     files: Annotated[tuple[Path, ...], Argument(positional=True, metavar="FILE")]
-    """Recordings (.mcap), one from each process; or a single recording of a killed flight, to add
-    the missing end that other programs expect.
+    """Recordings (.mcap), one from each process; or the single recording of a killed flight, to
+    which `join` adds the end that other programs expect.
     """
     record: Path
     """File for the recording of the flight (.mcap)."""

@@ -68,7 +68,7 @@ def keygen(argv: Sequence[str]) -> None:
 def make(
     file: Path, vehicles: Sequence[int], number: int | None = None, *, add: bool = False
 ) -> None:
-    """Make one key per vehicle, in a new file or at the end of an existing one.
+    """Make one key per vehicle, in a new file or at the end of an existing file.
 
     Args:
         number: number of the new keys; by default each vehicle's next number.
@@ -91,7 +91,7 @@ def make(
 
 
 def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
-    """Number of a vehicle's new key: `asked`, by default the next after those present."""
+    """Number of a vehicle's new key: `asked`, by default one more than its highest number."""
     numbers = present.numbers(vehicle)
     what = f"{present.name}: vehicle {vehicle}"
     if len(numbers) == KEYS_MAX:
@@ -114,7 +114,7 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
 
 
 def _write(path: Path, lines: Sequence[str], *, add: bool) -> None:
-    """Write lines to a new file of mode 0600, or to the end of an existing one."""
+    """Write lines to a new file of mode 0600, or to the end of an existing file."""
     try:
         private_files.check(path)
         before = HEAD.encode()

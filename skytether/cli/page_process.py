@@ -26,7 +26,7 @@ def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
 
     Args:
         at: HOST:PORT of the page; NONE or None for no page.
-        folder: folder of the flight's sockets; with a page, a temporary one if None.
+        folder: folder of the flight's sockets; with a page, None makes a temporary folder.
     """
     if at is None or at == NONE:
         yield folder

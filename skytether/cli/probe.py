@@ -57,7 +57,7 @@ SECONDS_MAX, RATE_MAX = 86_400.0, 1000.0
 SECRET_BYTES = 32
 SCENARIO = "paths.toml"
 MODELS_SHOWN = 3
-"""Number of printed models, for delays and for losses of each direction."""
+"""Largest number of models printed for the delays, and for the losses, of each direction."""
 
 
 @dataclass(frozen=True)
@@ -69,15 +69,15 @@ class ProbeOptions:
         Argument(
             metavar="LOCAL=HOST:PORT",
             append=True,
-            help="Path to the other end, in place of HOST:PORT, as in `skytether client`; may be "
-            "repeated, to measure up to four paths at once, and how often all fail together.",
+            help="Path to the other end, in place of HOST:PORT, as in `skytether client`; repeat "
+            "it to measure up to four paths at once, and how often all paths fail together.",
         ),
     ] = ()
     listen: Annotated[str | None, Argument(metavar="HOST:PORT")] = None
     """Run as the listening end: answer probes at this address until Ctrl-C."""
     files: Annotated[tuple[Path, ...], Argument(name="from", metavar="FILE", append=True)] = ()
-    """Log of ping, fping or irtt, or a table, to read instead of measuring; repeated for up to four
-    paths that were measured at the same time.
+    """Log of ping, fping or irtt, or a table, to read instead of measuring; repeat it for up to
+    four paths that were measured at the same time.
     """
     duration: float = 60.0
     """Length of the measurement [s]."""
@@ -86,17 +86,17 @@ class ProbeOptions:
     bytes: int = 400
     """UDP payload of each packet [B]."""
     keys: Path | None = None
-    """File by `skytether keygen` with the vehicle's key, or for --listen with the keys of all
-    vehicles: packets are encrypted. Without keys they are plaintext, which is refused beyond this
-    machine.
+    """File made by `skytether keygen`, with which packets are encrypted: it has the vehicle's key,
+    or for --listen the keys of all vehicles. Without keys, packets are plaintext, which is refused
+    beyond this machine.
     """
     number: Annotated[int, Argument(name="id")] = 1
-    """Number of the vehicle whose key is used; each further --path uses the next vehicle's."""
+    """Number of the vehicle whose key is used; each further --path uses the next vehicle's key."""
     insecure: bool = False
     """Allow plaintext beyond this machine: anybody on the path can alter the measurement."""
     out: Path = Path("probed")
-    """Folder for the traces, uplink.csv and downlink.csv. For several paths it also gets
-    uplink-path-2.csv and so on, and paths.toml, a scenario over all of them.
+    """Folder for the traces uplink.csv and downlink.csv; for several paths also for
+    uplink-path-2.csv and so on, and for paths.toml, a scenario over all measured paths.
     """
     json: Path | None = None
     """File for all figures, as JSON."""
@@ -109,11 +109,11 @@ class ProbeOptions:
 def probe(argv: Sequence[str]) -> None:
     """Measure a path over UDP: delays each way, loss, bursts, reordering, rate; fit models.
 
-    One end listens and answers; the other sends numbered packets and prints the results. Run the
-    listener at the server's place and the sender at the vehicle's: then the packets measure the
-    downlink, and the answers the uplink. Ctrl-C ends the measurement and prints the results so far.
-    With --from, probe analyses logs of other programs. For several paths it also prints how often
-    each failed, and how often all failed at once.
+    One end listens and answers; the other end sends numbered packets and prints the results. If the
+    listener runs at the server's place and the sender on the vehicle, the packets measure the
+    downlink and the answers measure the uplink. Ctrl-C ends the measurement and prints the results
+    so far. With --from, probe analyses logs of other programs. For several paths probe also prints
+    how often each path failed, and how often all failed at once.
     """
     options = read(ProbeOptions(), argv, "skytether probe", probe.__doc__)
     listens = options.listen is not None
@@ -256,7 +256,7 @@ def _conclude(
     """Write and print results.
 
     Args:
-        trips: round trips of each path; ignored for a single one.
+        trips: round trips of each path; ignored for a single path.
     """
     outcomes = [outcome for _, outcome in results]
     try:
@@ -344,7 +344,7 @@ def _check(options: ProbeOptions, paths: int) -> None:
 
 
 def _trace_name(way: str, path: int) -> str:
-    """File name of a trace, as in `skytether export`, for a direction `way`; paths count from 0."""
+    """File name of a trace, as in `skytether export`. `way`: the direction; paths count from 0."""
     return f"{way}-path-{path + 1}.csv" if path else f"{way}.csv"
 
 
@@ -437,7 +437,7 @@ def _flights(options: ProbeOptions, outcomes: Sequence[ProbeOutcome]) -> Sequenc
 
 
 def _missing(delays: Delays) -> int:
-    """Number of packets missing from a series that was sent at an even rate."""
+    """Number of packets missing from a series that was sent at a constant rate."""
     if len(delays.time_s) < 3:
         return 0
     apart_s = np.diff(delays.time_s)
@@ -494,7 +494,7 @@ def _figures(way: DirectionFigures) -> dict[str, str]:
 
 
 def _models(ways: dict[str, DirectionFigures]) -> "Table":
-    """Best models of both directions, each with its BIC minus that of the best model."""
+    """Best models of both directions, each with its BIC minus the BIC of the best model."""
     from rich.table import Table
     from rich.text import Text
 

@@ -1,8 +1,8 @@
 """Flight over real UDP: server, netem and client as processes on loopback.
 
 Each process writes its events as JSON on its standard output (`--log json`). Other output, such as
-a traceback or an error message, is kept to report why the process failed. The loop is asyncio's
-own: uvloop would reset signals that the children must go on ignoring.
+a traceback or an error message, is kept to report why the process failed. The event loop is
+asyncio's own, because uvloop would reset signals that the children must continue to ignore.
 """
 
 import asyncio
@@ -46,12 +46,12 @@ from skytether.shell.processes.workers import die_with_parent
 
 ANYWHERE = ("--bind", "127.0.0.1:0")
 NAMES = ("client", "server", "netem")
-"""Names of the processes, and of their parts of the record; further paths have `netem 2`, …"""
+"""Names of the processes and of their parts of the record; further paths add `netem 2`, …"""
 STANDBY = "server 2"
 """Name of the standby server."""
 
 START_S = 120.0
-"""Longest time until a process listens [s]; long, because it may have to compile kernels."""
+"""Longest time until a process listens [s]. The process may have to compile kernels first."""
 GRACE_S = 30.0
 """Longest time that a flight may take beyond its duration and the time to connect [s]."""
 ASKED_S, STOP_S = 3.0, 5.0
@@ -62,8 +62,8 @@ LINES_MAX = 20
 """Number of a process's last lines that are kept, to be printed if it fails."""
 
 Chain = Sequence[Sequence[Sequence[str]]]
-"""Stages of processes, each with its name and arguments. At the end of an argument, `{server}` is
-replaced by the address of the process `server` of an earlier stage."""
+"""Processes in stages, each process as its name and arguments. At the end of an argument,
+`{server}` is replaced by the address of the process `server` of an earlier stage."""
 OnEvent = Callable[[LogLine], None]
 Shortfall = RecordIncomplete | NotFlown
 """Events that do not end a flight; the command reports them at the end."""
@@ -93,7 +93,7 @@ class Child:
     def last_words(self) -> str:
         """Reason why the process ended: a signal, or the last line of its output."""
         code = self.process.returncode
-        if code is not None and code < 0:  # ended by a signal: its last line is not the reason
+        if code is not None and code < 0:  # a signal ended it, so its last line is not the reason
             return f"{self.name}: ended by a signal: {signal.strsignal(-code)}"
         if self.said:
             return self.said[-1]
@@ -108,10 +108,10 @@ async def started(
     """Start a process that listens; at the end of the block it gets SIGTERM, then SIGKILL.
 
     Args:
-        name: process to run: server, netem or client; `netem N` is that of path N, and `server 2`
-            the standby server.
-        arguments: its command line, beside `--log json`.
-        on_event: called with each line of its log.
+        name: process to run: server, netem or client; `netem N` is the netem of path N, and
+            `server 2` the standby server.
+        arguments: the process's command line, without `--log json`.
+        on_event: called with each line of the process's log.
 
     Raises:
         CommandError: the process ended, or did not listen in time.
@@ -129,7 +129,7 @@ async def started(
         "json",
         stdout=asyncio.subprocess.PIPE,
         stderr=asyncio.subprocess.STDOUT,
-        # Ctrl-C is for the command only, which ends its children in order.
+        # Ctrl-C must reach only the command, which ends its children in order.
         start_new_session=True,
         preexec_fn=die_with_parent,
     )
@@ -194,7 +194,7 @@ async def _read(child: Child, stream: asyncio.StreamReader, on_event: OnEvent) -
 
 
 def netems(scenario: Scenario, *, standby: bool = False) -> list[str]:
-    """Names of the netems of a scenario's paths, and of the one to the standby server."""
+    """Names of the netems of a scenario's paths, and of the standby server's netem."""
     return list(NETEMS[: len(scenario.paths) + standby])
 
 
@@ -224,7 +224,7 @@ def run(
     the flight or its record that the processes reported; empty for a good flight.
 
     Args:
-        parts: the folder, for each process's record and, as `.json`, its figures.
+        parts: the folder. Each process writes its record there and, as `.json`, its figures.
         on_second: called with the time flown [s], several times a second.
         interrupted: called several times a second; once true, the flight ends in order.
         on_event: called with each line of the processes' logs.
@@ -233,14 +233,14 @@ def run(
         watched: whether server and netem record, too.
         secure: whether the link is encrypted, with keys made for this flight.
         set_parameters: whether the client makes its autopilot's parameters safe.
-        sockets: folder for two sockets of each process: `server`, through which keys change in
-            flight, and `server.feed`, its feed; of several workers, `server.1`, `server.feed.1`.
-        standby: whether there is a standby server, `server 2`, behind a netem of its own; one of
-            the two may then end during the flight.
+        sockets: folder for two sockets of each process, such as `server` for changes in flight and
+            `server.feed` for the feed; several workers have `server.1`, `server.feed.1` and so on.
+        standby: whether there is a standby server, `server 2`, behind a netem of its own. One of
+            the two servers may then end during the flight.
 
     Raises:
-        CommandError: one of the processes failed, the folder cannot be written to, or it was
-            interrupted before the first step.
+        CommandError: one of the processes failed, the folder cannot be written to, or the flight
+            was interrupted before the first step.
     """
     file = parts / "scenario.toml"
     try:
@@ -320,7 +320,7 @@ def flown(scenario: Scenario, fly: Callable[[Scenario, Path], list[Shortfall]]) 
 def record_of(
     parts: Path, scenario: Scenario, shortfalls: Sequence[Shortfall], said: Sequence[LogLine] = ()
 ) -> Record:
-    """Record of a flight, from the files of its processes; time starts at their first event.
+    """Record of a flight, from its processes' files. Time 0 is the processes' first event.
 
     Args:
         parts: see `run`.
@@ -385,7 +385,7 @@ async def _fly(
 
     Args:
         spares: names of processes; all but one of them may end during the flight.
-        timeout_s: longest time that they run [s].
+        timeout_s: longest time that the processes run [s].
         on_second, on_event: see `run`.
 
     Raises:

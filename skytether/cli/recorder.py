@@ -26,13 +26,13 @@ from skytether.view.frames import of_flight
 from skytether.view.recordings.recording import About, Recording
 
 FLUSH_S = 0.25
-"""Interval at which new frames are written [s]; a killed process loses at most this much."""
+"""Interval at which new frames are written [s]. If killed, a process loses the last interval."""
 PATIENCE_S = 3.0
 """Longest time to wait at the end for the rest of the feeds [s]."""
 
 
 def check(path: Path, flag: str = "--record") -> None:
-    """Refuse a file name without the suffix of a recording, before anything is flown."""
+    """Refuse a file name without the suffix of a recording, before the flight begins."""
     if path.suffix != RECORDING:
         message = f"{flag}: got {path}, expected a file that ends in {RECORDING}"
         raise CommandError(message, command.CONFIGURATION)
@@ -84,7 +84,7 @@ def beside() -> int:
 class _Source:
     begun: bool = False
     ended: bool = False
-    """Whether the feed has ended and is not yet open again."""
+    """Whether the feed has ended and was not opened again yet."""
     resumed: bool = False
     """Whether the next frames may repeat earlier ones."""
     last_ns: int = 0
@@ -223,7 +223,7 @@ class Live:
             except OSError as error:
                 self._recording = None
                 self._miss(error.strerror or str(error))
-            # The process's rows do not match the columns that it announced.
+            # The process sent rows that do not match the columns that it announced.
             except ValueError as error:
                 self._miss(str(error))
 

@@ -1,8 +1,8 @@
 """`skytether ros2`: plans and goals of a flight, for RViz and other tools of ROS 2.
 
-It reads the server's feed, publishes plans as nav_msgs/Path, and sends each goal that arrives as
-geometry_msgs/PoseStamped to the server's control socket. So a goal is checked like any other change
-in flight, and the server needs no ROS.
+The command reads the server's feed, publishes plans as nav_msgs/Path, and sends each goal that
+arrives as geometry_msgs/PoseStamped to the server's control socket. So a goal is checked like any
+other change in flight, and the server needs no ROS.
 """
 
 import asyncio
@@ -60,11 +60,11 @@ class Ros2Options:
 def connect(argv: Sequence[str]) -> None:
     """Publish the plans of a flight in ROS 2, and accept goals from ROS 2, until SIGINT or SIGTERM.
 
-    For each vehicle N it publishes nav_msgs/Path on /skytether_N/plan, and subscribes to
+    For each vehicle N the command publishes nav_msgs/Path on /skytether_N/plan, and subscribes to
     geometry_msgs/PoseStamped on /skytether_N/goal_pose: a goal of a mission, or the position of a
-    live point. The flight's folder is the one given to `fly --control`, or one in which the server
-    has --feed FOLDER/server.feed and --control FOLDER/server. The flight may start, or restart,
-    later.
+    live point. FOLDER is the folder given to `fly --control`; a server started by hand needs --feed
+    FOLDER/server.feed and --control FOLDER/server. The flight may start, or restart, later than
+    this command.
     """
     options = read(Ros2Options(tyro.MISSING), argv, "skytether ros2", connect.__doc__)
     line = parse_line("--address", options.address)
@@ -95,7 +95,7 @@ class Bridge:
         self._columns: np.dtype[np.void] | None = None
         """Columns of the feed's rows of plans; None if the server records no plans."""
         self._nodes: dict[int, tuple[Node, GraphSession]] = {}
-        """Nodes by the numbers of their vehicles, at most VEHICLES_SHOWN_MAX."""
+        """Nodes by number of the vehicle; at most VEHICLES_SHOWN_MAX nodes."""
         self._paths: dict[int, Sequence[Vector]] = {}
         """Newest path of each node's vehicle [m]."""
         self._wanted: dict[int, Vector] = {}
@@ -129,7 +129,7 @@ class Bridge:
                 path = np.zeros((len(row["inputs"].T) + 1, 3))
                 path[:, : self._scenario.model.axes] = planned(self._scenario, row)
                 positions = [(x, y, z) for x, y, z in path.tolist()]
-                with suppress(RuntimeError):  # the loop has closed meanwhile
+                with suppress(RuntimeError):  # raised if the loop has closed meanwhile
                     self._loop.call_soon_threadsafe(self._show, vehicle, positions)
 
     def _show(self, vehicle: int, positions: Sequence[Vector]) -> None:

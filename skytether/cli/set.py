@@ -18,9 +18,9 @@ from skytether.shell.driving.control import Caller, ControlError
 @dataclass(frozen=True)
 class SetOptions:
     path: Annotated[Path, Argument(positional=True, metavar="PATH")]
-    """Control socket: the path given to server, netem or client as --control."""
+    """Control socket of a process: the path given to server, netem or client as --control."""
     changes: Annotated[tuple[str, ...], Argument(positional=True, metavar="KEY=VALUE")]
-    """Keys and values, as in network.uplink.loss=0.3; a value is TOML, otherwise a string."""
+    """Keys and values, as in network.uplink.loss=0.3; a value that is not TOML is a string."""
 
 
 def set_keys(argv: Sequence[str]) -> None:

@@ -17,9 +17,9 @@ The modules, in the order of their use:
 | `flying` | `fly(case) -> CaseOutcome`, the only function that flies; can run in a worker process |
 | `moments` | what went wrong, beside the same flight over a perfect network |
 | `units` | what the network did: outages, packets lost or late; and wind, noise, a stall |
-| `doubles`, `doubled` | a recorded flight over UDP as a case, and what is its own in virtual time |
+| `doubles`, `doubled` | a recorded flight over UDP, made a case that can be flown in virtual time |
 | `smallest` | delta debugging: the smallest set of units that suffices |
-| `causes` | the cause, single packets that would have averted it, how long an outage must be |
+| `causes` | the cause, packets that alone would avert the moment, shortest sufficient outages |
 | `remedies` | other keys, over the same network and with other seeds |
 | `explanation` | the whole explanation, step by step |
 | `words`, `picture` | the explanation as text and as a picture |
@@ -27,14 +27,14 @@ The modules, in the order of their use:
 
 **Cause.** A set of units *suffices* if the moment occurs with these units alone: within the window,
 every other packet is delivered within the usual delay, and there is neither wind nor noise unless
-they are in the set. It is *smallest* if no unit of it can be left out; there may be another such
-set. A unit is *needed* if the moment does not occur when only this unit is removed from the flight.
-No shares of blame are computed: if a vehicle brakes only because of two outages together, each of
-the two is needed.
+they are in the set. A sufficient set is *smallest* if no unit can be left out; there may be several
+smallest sets. A unit is *needed* if the moment does not occur when only this unit is removed from
+the flight. No shares of blame are computed: if a vehicle brakes only because of two outages
+together, each of the two is needed.
 
-**Limits.** It explains one flight of a simulated vehicle in simulated wind, or the double of a
-recorded flight, if that is near. A remedy that helps in one flight may fail in others; `--seeds`
-flies others. Of missions over UDP the recording suffices for `theorem`.
+**Limits.** An explanation is about one flight of a simulated vehicle in simulated wind, or about
+the double of a recorded flight, if the double is near that flight. A remedy that helps in one
+flight may fail in others; `--seeds` flies others. `theorem` checks recordings of missions over UDP.
 
 **Bounds.** Every figure comes from a flight; none is estimated. Every flight goes through `fly`.
 """

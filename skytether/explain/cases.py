@@ -1,7 +1,7 @@
 """Cases: flights that can be flown again, and units that can be removed from them.
 
-The impairment `delivered` changes the network, and keys change the wind: so a case is an ordinary
-scenario that any user can fly.
+The impairment `delivered` removes losses, and keys remove the wind. So a case is an ordinary
+scenario, which any user can fly.
 """
 
 from collections import defaultdict
@@ -20,18 +20,18 @@ from skytether.shared.scenario import dotted, reading
 from skytether.shared.scenario.whole import Scenario
 
 Lane: TypeAlias = tuple[int, int, int]
-"""Path, direction (UPLINK or DOWNLINK) and flow of packets, each from 0."""
+"""Numbers of a path, a direction (UPLINK or DOWNLINK) and a flow of packets, each from 0."""
 Keys: TypeAlias = tuple[tuple[str, Any], ...]
 """Keys of a scenario and their values."""
 
 
 ENDS = ("control", "link", "vehicle", "sensor")
-"""Sections whose keys may be what went wrong, if they are not those of the scenario's name."""
+"""Sections of keys that may be the cause, if they differ from the named scenario's keys."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """Slots of a lane, in milliseconds from its flow's first packet."""
+    """Slots of a lane from `first` to `end`: milliseconds since the flow's first packet."""
 
     lane: Lane
     first: int
@@ -41,28 +41,28 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True)
 class Bad(Stretch):
-    """Stretch in which the network loses all packets, or delays them too long."""
+    """Stretch in which the network loses all packets, or delays all packets too long."""
 
     is_late: bool = False
     is_packet: bool = False
-    """Whether it affects a single packet only."""
+    """Whether the stretch affects a single packet only."""
 
 
 @dataclass(frozen=True, slots=True)
 class UsualDelay:
-    """Usual delay of packets in a direction of a path, which every packet has at least."""
+    """Usual delay of packets in a direction; every packet is delayed at least that long."""
 
     direction: int
 
 
 @dataclass(frozen=True, slots=True)
 class Unmet:
-    """What the network would have lost or delayed of packets that this flight did not send."""
+    """Losses and delays that the network had for packets that this flight did not send."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Property of the scenario, such as wind, that other values of keys remove."""
+    """Property of the scenario, such as wind, that changed values of keys remove."""
 
     name: str
     keys: Keys
@@ -76,12 +76,12 @@ class Stall:
     at_s: float
     """Time of flight at the beginning [s]."""
     for_s: float
-    """Length [s]; infinite: it is killed."""
+    """Length [s]; infinite if the process is killed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Key that a person changes in flight."""
+    """Change of a key in flight by a person."""
 
     at_s: float
     """Time of flight [s]."""
@@ -95,9 +95,7 @@ Unit: TypeAlias = Bad | Unmet | UsualDelay | Setting | Stall | Command
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Double:
-    """What a case has of the recorded flight that it is the double of; times are those in the
-    flight.
-    """
+    """Data of a recorded flight that its double needs; times are times of flight."""
 
     opens_s: float
     """Time at which the vehicle asks for a session [s]."""
@@ -107,11 +105,11 @@ class Double:
     """Whether the client sent anything at step 0."""
     client_late_ns: Mapping[int, int]
     server_late_ns: Mapping[int, int]
-    """How late an end was woken, by the time at which it should have been [ns]."""
+    """Delay with which an end was woken, by the time for which its timer was set [both ns]."""
     states: Array
     """Position [m] and velocity [m/s] at the start of each step; shape (steps, axes, 2)."""
     inputs: Array
-    """Desired velocity from there on [m/s]; shape (steps, axes)."""
+    """Desired velocity that is flown from each step on [m/s]; shape (steps, axes)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,14 +122,14 @@ class FlightCase:
     stalls: tuple[Stall, ...] = ()
     commands: tuple[Command, ...] = ()
     overridden: Keys = ()
-    """Keys that differ from those of the scenario's name, with the values that it has there."""
+    """Keys whose values differ from the named scenario's, with the named scenario's values."""
     keys: Keys = ()
     delivered: tuple[tuple[Stretch, float], ...] = ()
-    """Stretches in which every packet arrives, and the longest delay in each [s]."""
+    """Stretches in which every packet arrives, each with the longest delay in it [s]."""
     until_s: float | None = None
     """Time of flight at which the flight may end [s]; None: at its regular end."""
     double: Double | None = None
-    """Recorded flight of which it is the double; None for a flight in virtual time."""
+    """Recorded flight of which the case is the double; None for a flight in virtual time."""
     standby: bool = False
     """Whether there is a standby server, behind a network of its own."""
 
@@ -160,7 +158,7 @@ class FlightCase:
 
 
 def overridden(scenario: Scenario, name: str) -> Keys:
-    """Keys of both ends that differ from those of a named scenario, with its values."""
+    """Keys of ENDS that differ from the named scenario's, with the named scenario's values."""
     try:
         named = dict(dotted.flat(reading.to_table(reading.load(name))))
     except ConfigError:  # a recording's scenario, whose file is elsewhere

@@ -1,8 +1,8 @@
 """Cause of a moment: the smallest set of units that suffices, and the effect of each.
 
-It is searched among more and more units: first units shortly before the moment, then from the
-flight's beginning on, then also the usual delay. The search uses the first of these groups without
-which the moment does not occur; without such a group, the cause is the scenario.
+Three groups of units are tried: units shortly before the moment, units from the flight's beginning
+on, and these units with the usual delay. The search uses the first group without which the moment
+does not occur; if there is no such group, the cause is the scenario.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,12 +29,12 @@ from skytether.explain.units import PUSH, Circumstances
 from skytether.shared.endpoints.directions import FLIGHT
 
 BEFORE_S = 8.0
-"""Time before a moment in which its cause is searched first [s]; longer than two time-outs, a
-horizon and the delays."""
+"""Time before a moment in which its cause is searched first [s]. It is longer than two time-outs, a
+horizon and the delays together."""
 SHORTEST_MS = 20
 """Accuracy of the length of the shortest outage that suffices [ms]."""
 PACKETS_MAX = 64
-"""Largest number of packets, the newest before the moment, whose single delivery is tested."""
+"""Number of newest packets before the moment that `rescues` delivers one at a time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,20 +43,20 @@ class CausePart:
 
     unit: Unit
     start_s: float
-    """Time of flight at its beginning [s]; 0 for permanent units."""
+    """Time of flight at the unit's beginning [s]; 0 for permanent units."""
     end_s: float
     is_needed: bool
     """Whether the moment does not occur without this unit."""
     error_m: float
     """Largest error without this unit [m]."""
     calm_m: float = np.nan
-    """The same without wind either, for the double of a real vehicle, whose wind is unknown [m]."""
+    """Largest error without this unit and wind [m]; NaN except for a real vehicle's double."""
     packets: int = 0
     """Number of packets that the unit lost or delayed."""
     plans: int = 0
     """Number of plans among these packets."""
     shortest_s: tuple[float, float] | None = None
-    """Lengths of the shortest sufficient outages that begin or end as this one does [s], sorted."""
+    """Lengths of the shortest sufficient outage with this begin, and with this end [s]; sorted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,10 +72,9 @@ class Cause:
     error_m: float
     """Largest error with this cause alone [m]."""
     averting: tuple[CausePart, ...] = ()
-    """Smallest set without which the moment does not occur; empty if it does not occur without
-    `parts`."""
+    """Smallest set without which the moment does not occur; empty if removing `parts` suffices."""
     others: tuple[CausePart, ...] = ()
-    """Losses and late packets that were examined and are in neither set."""
+    """Losses and late packets that were examined, but are neither in `parts` nor in `averting`."""
     innocent: tuple[tuple[str, float], ...] = ()
     """Groups of units outside the cause, and the change of the error without each group [m]."""
 
@@ -101,7 +100,7 @@ class Rescues:
 def cause(
     case: FlightCase, moment: Moment, flown: CaseOutcome, fly_all: FlyAll, at_once: int
 ) -> tuple[Cause, Circumstances]:
-    """Find the cause of a moment, without its parts' effects; also returns the circumstances."""
+    """Cause of a moment, without the effects of its parts, and the units that were examined."""
     case = replace(case, until_s=moment.end_s + AFTER_S + 1.0)
 
     def suffice(cases: Iterable[FlightCase]) -> list[bool]:
@@ -119,7 +118,7 @@ def cause(
             if is_averted(moment, bare):
                 break
     if not tried:
-        return Cause((), 0.0, len(here.units) - 1, error_m(moment, bare)), here  # but `Unmet`
+        return Cause((), 0.0, len(here.units) - 1, error_m(moment, bare)), here  # without `Unmet`
     since_s, here = tried[-1]
     met = tuple(each for each in here.units if each != Unmet())
     (is_enough,) = suffice([here.only(met)])
@@ -142,7 +141,7 @@ def cause(
 
 
 def _in_order(found: Sequence[Unit]) -> list[Unit]:
-    """Units of a set, single packets last: there may be many of them."""
+    """Units of a set, sorted so that single packets, of which there may be many, come last."""
     return sorted(found, key=lambda each: isinstance(each, Bad) and each.is_packet)
 
 
@@ -169,8 +168,8 @@ def _met(unit: Bad, flown: CaseOutcome) -> list[int]:
 def needed(
     found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll
 ) -> tuple[Cause, list[CaseOutcome]]:
-    """Add to a cause the results of flights without each part and without each other group; also
-    returns the flights without each part.
+    """Fly without each part of a cause, and without each other group of units. Returns the cause
+    with the results, and the flights without each part.
     """
     parts, others = found.parts, _groups(found, here)
     cases = [here.without(part.unit) for part in parts]
@@ -212,7 +211,7 @@ WHAT = {
     (True, False): "time of late packets",
     (True, True): "late packet",
 }
-"""Nouns for bad stretches: by late or lost, and by single packet or longer."""
+"""Nouns for bad stretches, by `is_late` and `is_packet`."""
 
 
 def named(unit: Unit) -> str:
@@ -241,7 +240,7 @@ def lane_name(lane: Lane) -> str:
 def rescues(
     found: Cause, here: Circumstances, moment: Moment, flown: CaseOutcome, fly_all: FlyAll
 ) -> Rescues:
-    """Packets of the cause, sent before the moment, each of which averts it if delivered."""
+    """Packets of the cause, sent before the moment, each of which alone averts it if delivered."""
     packets = flown.packets
     bad = [part.unit for part in found.parts if isinstance(part.unit, Bad)]
     numbers = sorted(number for unit in bad for number in _met(unit, flown))
@@ -259,7 +258,7 @@ def rescues(
 def lengths(found: Cause, here: Circumstances, moment: Moment, fly_all: FlyAll) -> Cause:
     """Add to a cause the shortest sufficient length of each needed outage, found by bisection.
 
-    The moment occurs from this length on, provided that it occurs for all longer outages.
+    Bisection assumes that the moment also occurs with every longer outage.
     """
     tasks = [
         (number, from_end, part.unit)
