@@ -8,7 +8,7 @@ from skytether.shell.commandline import start
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit code."""
+    """Run the command, and return its exit code."""
     argv = sys.argv[1:] if argv is None else argv
     name, *rest = argv or ["--help"]
     if name in COMMANDS:

@@ -41,7 +41,7 @@ def speed_bounds(u_max: Array, gain: Array, speed_mps: float) -> Array:
 
 
 class Motion(NamedTuple):
-    """Position of a vehicle at every time, in the vehicle's own steps."""
+    """Position of a vehicle at every time; times are counted in the vehicle's own steps."""
 
     first: int
     """Step of the first knot, a multiple of SPACING."""
@@ -105,7 +105,7 @@ class Clearances(NamedTuple):
 
 
 def bend_m(acceleration_mps2: float, dt_s: float) -> float:
-    """Largest distance of a motion of at most this acceleration from its straight pieces [m]."""
+    """Largest distance of a motion from its straight pieces [m], given its largest acceleration."""
     return acceleration_mps2 * (SPACING / SAMPLES * dt_s) ** 2 / 8.0
 
 

@@ -54,7 +54,7 @@ class AxisSpline(NamedTuple):
     gain_v: float
     """K on velocity."""
     lag: float
-    """Share λ of the previous input in the new one, 0 to below 1."""
+    """Share λ of the previous input in the new input; 0 ≤ λ < 1."""
 
 
 def spline_at(knots: Knots, spacing: int, dt_s: float, stage: int) -> tuple[float, float]:

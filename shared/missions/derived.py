@@ -26,7 +26,7 @@ def lands(scenario: Scenario) -> bool:
 
 
 def rest_scale(scenario: Scenario) -> float:
-    """Factor on vertical distances between vehicles at rest; 0 if they may land below another."""
+    """Factor on vertical distances of resting vehicles. 0: they may land, heights do not count."""
     return 0.0 if lands(scenario) else scenario.section(MissionConfig).height_scale
 
 

@@ -1,7 +1,7 @@
 """Missions: timed goals or timed paths (a show) of several vehicles, kept apart by the server.
 
-A mission is also the reference of a vehicle: its present goal, with velocity 0; in a show, the
-present point and velocity of its path.
+A mission is also the reference of a vehicle: the vehicle's present goal with velocity 0, or in a
+show the present point and velocity of the vehicle's path.
 """
 
 from bisect import bisect_right
@@ -19,7 +19,7 @@ from skytether.shared.scenario.points import timed_path
 from skytether.shared.scenario.reference import FAR_M, OfFleet, Reference
 
 SWAP_AT_S = 2.0
-"""Time at which vehicles that swap places depart."""
+"""Time at which vehicles that swap places depart [s]."""
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
 """Azimuth between consecutive points of a Fibonacci sphere [rad]."""
 TINY_MPS = 1e-6
@@ -155,7 +155,7 @@ class Mission(OfFleet):
 
 
 class _Stays(NamedTuple):
-    """Stays of all vehicles: each at a goal, from its time until the time of the next goal."""
+    """Stays of all vehicles at goals. A stay lasts from its goal's time to the next goal's time."""
 
     vehicles: NDArray[np.int64]
     begin_s: Array
@@ -336,8 +336,8 @@ class Guided:
         return self._kept(vehicle)
 
     def _of(self, vehicle: int) -> Reference:
-        """Reference of a vehicle: after time 0 its replaced goal, if it has one; otherwise the
-        mission's goal.
+        """Reference of a vehicle: the mission's, or after time 0 the goal that replaces the
+        mission's goals.
         """
         original = self._references(vehicle)
 

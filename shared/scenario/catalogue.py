@@ -1,4 +1,4 @@
-"""Catalogue of a scenario's keys: owner, term, and whether it may change in flight.
+"""Catalogue of a scenario's keys: owner, term, and whether the key may change in flight.
 
 A key that both ends use for predictions is a term, and must be equal at both. Any other key belongs
 to one end, or to each end separately. A key without an owner in its type fails at import.

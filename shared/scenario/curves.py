@@ -12,8 +12,8 @@ from skytether.shared.scenario.registry import REFERENCES
 from skytether.shared.scenario.schema import Scenario
 
 reference = REFERENCES
-"""Decorator of a shape: a function of the `Scenario` and its own numbers, returning a
-`Reference`."""
+"""Decorator of a shape. A shape is a function that takes the `Scenario` and the shape's own
+numbers, and returns a `Reference`."""
 
 
 def circle(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:

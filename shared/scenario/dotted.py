@@ -1,7 +1,7 @@
 """Dotted keys such as `control.horizon`, for reading and setting values in nested tables.
 
 A key may also address an argument in a text: `network.uplink.loss` is the first argument of `loss`
-in `network.uplink`, and `control.trigger.state_gap.decay_rate` is an argument by name.
+in `network.uplink`, and `control.trigger.state_gap.decay_rate` the argument `decay_rate`.
 """
 
 from collections.abc import Iterator, Mapping
@@ -50,7 +50,7 @@ def set_keys(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
 
 
 def text_key(key: str) -> str:
-    """Key of the text whose argument `key` addresses; any other key unchanged."""
+    """Key of the text, if `key` addresses an argument of a text; otherwise `key` itself."""
     return next((each for each in TEXTS if key.startswith(f"{each}.")), key)
 
 

@@ -45,7 +45,7 @@ class Key(msgspec.Struct, frozen=True):
     in_flight: str = ""
     """Group with which the key may change in flight; empty if it may not change."""
     term: str = ""
-    """Field of `Terms` for a key of both ends; empty if it has the key's name."""
+    """Field of `Terms` for a key of both ends; empty if the field has the key's name."""
     is_decision: bool = False
     """Whether the key is set in flight only, and forgotten when the process restarts."""
 

@@ -57,7 +57,7 @@ def timed_path(times_s: Array, points_m: Array, *, loop: bool = False) -> Refere
 def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Reference:
     """Path through points [m; shape (n, axes)] at constant speed.
 
-    With `loop` it returns to the first point and repeats.
+    With `loop` the path returns to the first point and repeats.
 
     Raises:
         ValueError: see `timed_path`; or two points are too close to each other.

@@ -48,7 +48,7 @@ def names(file: str = "") -> list[str]:
     """Names of the built-in scenarios, or of the scenarios in a file of several.
 
     Args:
-        file: COMPARED, or the path of a file with one scenario per table; empty: built-in ones.
+        file: COMPARED, or path of a file with one scenario per table; empty: built-in scenarios.
 
     Raises:
         ConfigError: the file cannot be read.
@@ -300,7 +300,7 @@ def _with_paths(raw: dict[str, Any], source: str) -> dict[str, Any]:
     network: Any = raw.get("network")
     paths = network.get("paths") if isinstance(network, Mapping) else None
     if not (isinstance(paths, list | tuple) and all(isinstance(each, Mapping) for each in paths)):
-        return raw  # no paths, or of a wrong type, which is refused elsewhere
+        return raw  # no paths, or paths of a wrong type, which other code refuses
     both = {way: getattr(NetworkConfig(), way) for way in WAYS}
     both |= {way: network[way] for way in WAYS if way in network}
     whole = [_overlay(both, dict(each), source, "network.") for each in paths]
@@ -323,7 +323,7 @@ def _path(file: str) -> Path:
         return SCENARIOS / f"{file}.toml"
     try:
         return Path(file).resolve()
-    except (ValueError, OSError, RuntimeError) as error:  # a NUL character, or a cycle of links
+    except (ValueError, OSError, RuntimeError) as error:  # such as a NUL, or a cycle of links
         raise ConfigError(f"{file}: cannot be read: {error}") from None
 
 
@@ -339,7 +339,7 @@ def read_toml(path: Path, file: str) -> dict[str, Any]:
 def _overlay(
     below: dict[str, Any], above: dict[str, Any], source: str, prefix: str = ""
 ) -> dict[str, Any]:
-    """Merge two raw tables, `above` taking precedence; an argument given as a
+    """Merge two raw tables. Values in `above` take precedence; an argument that `above` has as a
     key changes the text.
     """
     merged = dict(below)

@@ -27,7 +27,7 @@ Reference = Callable[[NDArray[Any]], Array]
 
 
 class OfFleet(ABC):
-    """Desired trajectories of several vehicles, and one of them as a `Reference`."""
+    """Desired trajectories of several vehicles; a call returns one vehicle's, as a `Reference`."""
 
     @property
     @abstractmethod
@@ -53,8 +53,8 @@ def planar(
     axes: int,
     altitude_m: float,
 ) -> Reference:
-    """Planar curve at constant altitude, from functions of time that give (position, velocity) in x
-    and y.
+    """Planar curve at constant altitude. `x` and `y` are functions of time that return position and
+    velocity.
     """
 
     def sample(t: Array) -> Array:

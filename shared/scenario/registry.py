@@ -172,7 +172,7 @@ _OFFERED = Entry(_offered, (), "")
 
 
 class PluginTable(dict[str, Entry]):
-    """Entries of one kind by name, and the decorator that adds one.
+    """Entries of one kind by name. The table is also the decorator that adds an entry.
 
     Methods with a text of entries raise GrammarError if a part of it is invalid.
 
@@ -238,7 +238,7 @@ class PluginTable(dict[str, Entry]):
     def one(self, text: str) -> Call:
         """Parse a text that names a single entry."""
         call = grammar.parse(text, self.form)
-        # Without arguments, a text has no spaces or parentheses: other code compares it with names.
+        # A text without arguments must equal the name, because other code compares the two.
         if not isinstance(call, Call) or not (call.keys or text == call.name):
             raise GrammarError(text, self.form)
         return self._bound(call)

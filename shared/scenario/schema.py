@@ -72,7 +72,7 @@ TopicName = Annotated[str, Meta(max_length=200, pattern=r"^(/[A-Za-z_][A-Za-z0-9
 
 
 SHAPE_CHARS = 15
-"""Number of characters of a plug-in's shape in the terms, before its digest."""
+"""Number of characters of a plug-in's shape that precede the digest in the terms."""
 
 
 Contradiction = tuple[str, object, str]
@@ -144,8 +144,8 @@ class ControlConfig(Section, frozen=True):
     delay_bound: OfServer[Duration | Literal["auto"]] = "auto"
     """Longest time from planning a horizon until it is in force [s]; auto: as measured."""
     observer_s: OfServer[Duration] = 4.0
-    """Time constant of the estimate of steady wind and a wrong gain [s]; longer if observations are
-    old. 0, or scheme "none": no estimate."""
+    """Time constant with which steady wind and errors of the gain are estimated [s]; longer if
+    observations are old. 0, or scheme "none": no estimate."""
     trigger: OfTrigger[Text] = "expected_gap | heartbeat"
     """Rule for sending a horizon: policies combined with & and |, see `skytether list triggers`. An
     argument is also a key: `control.trigger.expected_gap = 0.1`."""
@@ -168,7 +168,7 @@ class ControlConfig(Section, frozen=True):
     """Weight S of eq. (9) on the change from the previous horizon; with the scheme "trajectory", on
     the change of the input from step to step [s²/m²]."""
     input_reference: OfServer[bool] = True
-    """Whether R weighs u - v_ref instead of u, so that it does not make the vehicle slower."""
+    """Whether R weighs u - v_ref instead of u; R then does not make the vehicle slower."""
 
     @property
     def properties(self) -> SchemeProperties:
@@ -182,15 +182,15 @@ class ReferenceConfig(Section, frozen=True):
     shape: Term[Text] = "circle"
     """Shape of the desired trajectory, see `skytether list references`."""
     preview: OfServer[Duration | Literal["all", "none"]] = "all"
-    """Time ahead for which the server knows the desired trajectory [s]; after that, and for a live
-    point, it extrapolates."""
+    """Time for which the server knows the desired trajectory in advance [s]. Beyond this time, and
+    for a live point, the server extrapolates."""
     agility: OfServer[Strength] = 0.3
     """Strength of the white acceleration of a target [m/s per √s]."""
     turn_every_s: OfServer[Duration] = 0.0
     """Mean time between turns of a target [s]; 0: its velocity changes all the time."""
     noise_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Noise of the server's measurement of a target's position at every step [m]; the server
-    filters position and velocity. 0: both are exact."""
+    """Standard deviation of the server's measurement of a target's position at every step [m], from
+    which the server estimates position and velocity. 0: the server knows both exactly."""
     radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
     """Half the width of the shape, or of a target's area [m]."""
     period_s: Term[Annotated[float, Meta(ge=0.1, le=86400)]] = 27.5
@@ -214,7 +214,7 @@ class ReferenceConfig(Section, frozen=True):
     scenario's folder."""
     origin: OfEach[tuple[Position, ...]] = ()
     """Latitude and longitude of the scenario's origin [degrees], and its altitude above the sea [m]
-    for files with such altitudes; default: those of the file, if it has them."""
+    for files with such altitudes; default: the origin in the file, if the file has one."""
 
 
 class VehicleConfig(Section, frozen=True):
@@ -226,8 +226,8 @@ class VehicleConfig(Section, frozen=True):
     """Connection to an autopilot: udp:HOST:PORT (listens there), udpout:HOST:PORT, tcp:HOST:PORT or
     serial:PATH:BAUD; to a robot that speaks ROS 2: tcp:HOST:PORT of a Zenoh router."""
     memory: OfVehicle[Annotated[str, Meta(max_length=4096)]] = "auto"
-    """Folder for the state that a restarted client needs; none: not saved; auto: for a vehicle with
-    an autopilot, the state folder of its service or user."""
+    """Folder for the state that a restarted client needs. none: no state is saved; auto: with an
+    autopilot, the state is saved in the state folder of the service or user."""
     report: OfVehicle[Text] = "deviation(0.05) | silence(1)"
     """Rule for sending an observation: policies joined by & and |, see `skytether list reports`."""
     exhausted: Term[Literal["hold", "brake"]] = "brake"
@@ -333,13 +333,13 @@ class LinkConfig(Section, frozen=True):
     """Largest age of the observation from which an input was computed [s]; after that the vehicle
     acts as at the end of a horizon (`vehicle.exhausted`)."""
     join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
-    """Time after a trajectory's first knot during which the vehicle accepts it [s]; 0: always. With
-    a limit the server knows which trajectory is flown."""
+    """Time after its first knot for which the vehicle accepts a trajectory [s]; 0: always. With a
+    limit the server knows which trajectory the vehicle flies."""
     asymmetry_s: OfServer[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Largest difference between the smallest delays of uplink and downlink over 20 s [s]; 0:
-    unknown. It bounds the error of the vehicle's clock."""
+    unknown. The value bounds the error of the vehicle's clock."""
     time_of_day: OfEach[Literal["none", "host"]] = "none"
-    """Source of the time of day on a mission; if both ends have one, their clocks are compared.
+    """Source of the time of day on a mission; if both ends have a source, clocks are compared.
     host: the host's clock, with an error bound from its kernel (chrony)."""
     timeout_s: OfEach[Interval] = 1.5
     """Silence after which the vehicle brakes and asks for a new session [s]. The server frees the
@@ -359,8 +359,8 @@ class LinkConfig(Section, frozen=True):
     def patience_ns(self) -> int:
         """Time of silence after which the server considers a vehicle lost [ns].
 
-        A vehicle brakes if its server is silent. The server only reserves the vehicle's number, so
-        it can wait longer, and then needs half as many heartbeats.
+        A vehicle brakes if its server is silent. A server only reserves the vehicle's number, so
+        the server can wait longer, and needs only half as many heartbeats of the vehicle.
         """
         timeout_ns = seconds_to_ns(self.timeout_s)
         if self.fixed_ns is not None:
@@ -378,8 +378,8 @@ class SimulationConfig(Section, frozen=True):
     clock_drift_ppm: OfVirtualTime[Annotated[float, Meta(ge=-1000, le=1000)]] = 0.0
     """Drift of the vehicle's clock, positive if faster than the server's [ppm]."""
     time_error_s: OfVirtualTime[Duration] = 0.0
-    """Error of the time of day on a mission [s]: positive at odd vehicles, negative at even ones
-    and the server; 0: no time of day."""
+    """Error of the time of day on a mission [s]: positive for vehicles with odd numbers, negative
+    for even numbers and the server; 0: no time of day."""
 
 
 S = TypeVar("S", bound=Section)

@@ -30,7 +30,7 @@ def target(
     """Random walk from the origin, by white acceleration or by random turns.
 
     Velocity and position are reflected at their bounds. Before time 0 the target is at rest at the
-    origin. After TURN_S it follows its path backwards.
+    origin. After TURN_S the target follows its path backwards.
 
     Args:
         rng: generator used by this walk only; states at later times draw more numbers.
@@ -74,7 +74,7 @@ class _Walk:
         self._positions = np.zeros((1, axes))
 
     def upto(self, last: int, *, agility: float, speed_mps: float) -> tuple[Array, Array]:
-        """Velocities [m/s] and positions [m] at grid points 0 … last, or more; (points, axes)."""
+        """Velocities [m/s], positions [m] at grid points 0 … last or more; shape (points, axes)."""
         while len(self._free) <= last:
             kicks = self._rng.standard_normal((GRID_BLOCK, self._free.shape[1]))
             if self._turns < 1.0:
@@ -158,7 +158,7 @@ def _steady_gains(dt_s: float, noise_m: float, agility: float) -> tuple[float, f
 
 @REFERENCES(name="target")
 def flown_target(scenario: Scenario) -> Reference:
-    """Random walk known only to the server, of `agility`, within `speed_mps` and `radius_m`."""
+    """Random walk that only the server knows, by `agility`, `speed_mps` and `radius_m`."""
     config = scenario.reference
     return target(
         stream(scenario.seed, "target"),

@@ -30,7 +30,7 @@ def explain(message: str, raw: Mapping[str, Any], scenario: type[Any]) -> str:
         raw: table of plain values that was to be converted.
         scenario: class of the scenario.
     """
-    # Unknown keys first: their names may contain any text, even the syntax of msgspec's messages.
+    # Unknown keys come first, because their names may contain any text, even msgspec's syntax.
     if unknown := _unknown_key(raw, scenario):
         return unknown
     parts = _ERROR.fullmatch(message)

@@ -43,7 +43,7 @@ def counted(figures: Mapping[str, Any]) -> ProcessCounts:
     """Counts of dropped packets among the figures of a process.
 
     Raises:
-        ValueError: a count is of another type.
+        ValueError: a count has a wrong type.
     """
     return msgspec.convert(figures, ProcessCounts)
 

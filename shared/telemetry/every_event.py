@@ -19,7 +19,7 @@ for module in EVENTS:
 
 
 def kinds(base: type[Event] = Event) -> Iterator[type[Event]]:
-    """Classes of events that are defined so far: those without subclasses."""
+    """Classes of events that are defined so far and have no subclasses."""
     for kind in base.__subclasses__():
         if kind.__subclasses__():
             yield from kinds(kind)

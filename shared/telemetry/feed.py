@@ -28,7 +28,7 @@ class FeedError(ValueError):
 
 
 class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=True):
-    """A process and its scenario: the first frame of its feed."""
+    """First frame of a feed: the process, and its scenario."""
 
     process: str
     """Name of the process: server, netem or client; `server.N` is worker N of a server."""
@@ -60,7 +60,7 @@ class Said(msgspec.Struct, frozen=True, tag=True, kw_only=True):
 
 
 class Figures(msgspec.Struct, frozen=True, tag=True, kw_only=True):
-    """Figures so far, about once a second."""
+    """Frame with the process's figures so far, sent about once a second."""
 
     time_ns: int
     figures: dict[str, Any]

@@ -123,11 +123,11 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),
-            ("reference", "<f8", (axes, 2)),  # desired state x_d(k), as known at the tick
-            ("estimate", "<f8", (axes, 2)),  # x̂(k)
+            ("reference", "<f8", (axes, 2)),  # desired state x_d(k) as known then [m, m/s]
+            ("estimate", "<f8", (axes, 2)),  # estimated state x̂(k) [m, m/s]
             ("ahead", "<i8"),  # delay bound d: planning starts at k + d
-            ("planned", "<f8", (axes, 2)),  # x_p(k+d|k-1)
-            ("input", "<f8", (axes,)),  # û(k), or the committed input of k
+            ("planned", "<f8", (axes, 2)),  # planned state x_p(k+d|k-1) [m, m/s]
+            ("input", "<f8", (axes,)),  # û(k), or the committed input of step k [m/s]
             ("observed_step", "<i8"),  # step of the observation from which x̂ was predicted
             # state_gap, cost_gap, expected_gap [all: cost], deviation_m [m]. NaN without a plan;
             # expected_gap also without a trigger that needs it
@@ -153,7 +153,7 @@ def plan_columns(axes: int, planned: int) -> np.dtype[np.void]:
     return np.dtype(
         [
             ("vehicle", "<u2"),
-            ("step", "<i8"),  # k, the step of the plan
+            ("step", "<i8"),  # step k at which the plan was made
             ("begins", "<i8"),  # step of the first planned input, k + d
             ("state", "<f8", (axes, 2)),  # x̂(k+d), the state from which the inputs start [m, m/s]
             ("inputs", "<f4", (axes, planned)),  # desired velocity of each step [m/s]
@@ -190,7 +190,7 @@ class Sink(Protocol):
 
 
 class Recorder:
-    """Writes rows to sinks.
+    """Writer of rows to sinks.
 
     Args:
         sink: receives the header first; None for a recorder whose sinks are added by `follow`.

@@ -96,7 +96,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of failures of a plug-in's code at the server, by its kind; for all vehicles. None
     without the figures of the processes."""
     age_ms_p50: float | None
-    """Median age of the observation from which the flown input was computed, of all steps [ms]."""
+    """Median over all steps of the age of the observation behind the flown input [ms]."""
     age_ms_p99: float | None
     aoi_s_mean: float | None
     """Mean age of information: the age of the observation from which the input was computed [s],

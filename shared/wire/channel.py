@@ -179,7 +179,7 @@ class Channel:
         return True
 
     def retire(self, *, now_ns: int) -> None:
-        """Open only packets that are still in flight, for OVERLAP_NS from now on."""
+        """Open packets of this channel for OVERLAP_NS more, because some are still in flight."""
         # The minimum, because `retire` must never prolong the life of a channel.
         self._opens_until_ns = min(self._opens_until_ns, now_ns + OVERLAP_NS)
 

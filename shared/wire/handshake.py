@@ -115,14 +115,14 @@ def address(packet: bytes) -> tuple[int, int]:
 
 
 def read_initiation(key: VehicleKey, packet: bytes) -> Initiation:
-    """Parts of an INITIATION; ProtocolError if its sender does not have the key."""
+    """Parts of an INITIATION; raises ProtocolError if the sender does not have the key."""
     if not is_authentic(key, packet):
         raise ProtocolError(Drop.FORGED)
     return Initiation(packet[HEADER.size : _COOKIE_END], packet[_COOKIE_END:-MAC_BYTES])
 
 
 def read_challenge(key: VehicleKey, packet: bytes, public: bytes) -> bytes:
-    """Cookie in a CHALLENGE; ProtocolError if it does not answer this ephemeral key."""
+    """Cookie in a CHALLENGE; raises ProtocolError if the packet answers another ephemeral key."""
     if len(packet) != CHALLENGE_BYTES:
         raise ProtocolError(Drop.LENGTH)
     if not is_authentic(key, packet, public):
@@ -131,7 +131,7 @@ def read_challenge(key: VehicleKey, packet: bytes, public: bytes) -> bytes:
 
 
 def read_response(key: VehicleKey, packet: bytes, public: bytes) -> Response:
-    """Parts of a RESPONSE; ProtocolError if it does not answer this ephemeral key."""
+    """Parts of a RESPONSE; raises ProtocolError if the packet answers another ephemeral key."""
     if not RESPONSE_BYTES_MIN <= len(packet) <= INITIATION_BYTES:
         raise ProtocolError(Drop.LENGTH)
     if not is_authentic(key, packet, public):

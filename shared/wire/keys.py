@@ -136,7 +136,7 @@ def write(vehicle: int, number: int, secret: bytes) -> str:
 
 
 def _key(text: str, where: str) -> tuple[VehicleKey, bytes]:
-    """Key of a line, and its secret; errors do not repeat the line."""
+    """Key of a line, and the line's secret. Errors do not repeat the line, which is secret."""
     match = _LINE.fullmatch(text)
     if match is None:
         raise ConfigError(f"{where}: expected {_EXPECTED}")

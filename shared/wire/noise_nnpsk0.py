@@ -37,7 +37,7 @@ class NoiseError(Exception):
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Keys:
-    """Keys of the two directions, Split() of the handshake."""
+    """Keys of the two directions, which the handshake's Split() derives."""
 
     forth: bytes
     """Key for packets of the initiator."""

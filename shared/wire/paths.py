@@ -65,16 +65,16 @@ WAIT_NS, WAIT_MIN_NS, WAIT_MAX_NS = (
     150 * MILLISECOND_NS,
     5 * SECOND_NS,
 )
-"""Time after which an unacknowledged packet counts as lost [ns]: WAIT_NS before the first
-acknowledgement; later it is computed from measured delays, within WAIT_MIN_NS and WAIT_MAX_NS."""
+"""Time after which an unacknowledged packet counts as lost [ns]. Before the first acknowledgement
+it is WAIT_NS; later it follows from measured delays, within WAIT_MIN_NS and WAIT_MAX_NS."""
 SPARE_NS = 50 * MILLISECOND_NS
 """Margin added to measured delays before a packet counts as lost [ns]."""
 LOOK_NS, AGAIN_NS, DEAR_MAX = 2 * SECOND_NS, SECOND_NS, 8.0
 """Times after which an unused path is probed, and a doubted path is probed again [ns]. Both times
 are multiplied by the path's price, but at most by DEAR_MAX."""
 TRIES_MAX = 4
-"""Largest number of times that the interval between probes is doubled, on a path that delivers
-packets of the other end but none of this end."""
+"""Largest number of doublings of the interval between probes, on a path that delivers only the
+other end's packets."""
 DOUBT = 0.5
 """Probability of loss of the next packet on a path above which the path is doubted."""
 DEAD, DEAD_NS = 0.9, SECOND_NS
@@ -85,7 +85,7 @@ PATIENCE = 3
 ALIKE = 1.25
 """Factor on the least expected cost; sets of paths with a cost up to this are used in turn."""
 ALIVE_WORTH = 40.0
-"""Cost if the other end considers a working link lost [packets]."""
+"""Cost if the other end considers a working link lost, in packets of price 1."""
 _SETS = {
     count: [*chain.from_iterable(combinations(range(count), size) for size in range(1, count + 1))]
     for count in range(1, PATHS_MAX + 1)
@@ -142,7 +142,7 @@ class PathState:
     is_dead: bool = False
     """Whether the path is reported as dead."""
     tries: int = 0
-    """Number of probes without acknowledgement that arrivals over the path caused."""
+    """Number of unacknowledged probes that were sent because packets arrived over the path."""
 
     def failure(self, now_ns: int) -> float:
         """Probability q that a packet sent now does not arrive."""
@@ -154,7 +154,7 @@ class PathState:
 
         Args:
             under_way: number of packets in flight.
-            is_sent: whether another packet is sent now, which may arrive after an outage's end.
+            is_sent: whether one more packet is sent now, when an outage may have ended.
         """
         down, loss = self._down(now_ns), self.loss
         if is_sent and self.used_ns is not None:
@@ -459,7 +459,7 @@ class Paths:
     # -- receiving ---------------------------------------------------------------------------
 
     def is_copy(self, datagram: bytes, path: int | None) -> bool:
-        """Whether a datagram has arrived before; notes the path of the copy."""
+        """Whether a datagram has arrived before; if so, note the path of this copy."""
         sequence = self._copies.get(datagram)
         if sequence is None:
             return False

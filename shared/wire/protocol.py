@@ -135,7 +135,7 @@ class Observation(NamedTuple):
     vehicle: int
     session: int
     step: int
-    """Step k at whose start the state was sampled, on the vehicle's grid."""
+    """Step k at whose start the state was sampled, by the vehicle's count."""
     in_force: int
     """Step for which the horizon in force was made, or NO_HORIZON."""
     since: int
@@ -166,7 +166,7 @@ class Horizon(NamedTuple):
     vehicle: int
     session: int
     step: int
-    """Step k of the first input, on the vehicle's grid."""
+    """Step k of the first input, by the vehicle's count."""
     server_us: int
     age: int
     inputs: NDArray[np.float32]
@@ -184,7 +184,7 @@ class Trajectory(NamedTuple):
     vehicle: int
     session: int
     step: int
-    """Step k of the first knot, on the vehicle's grid."""
+    """Step k of the first knot, by the vehicle's count."""
     server_us: int
     age: int
     spacing: int
@@ -195,7 +195,7 @@ class Trajectory(NamedTuple):
 
 
 class Idle(IntEnum):
-    """Why the server sends no plan; PLANS if plans are made and the trigger decides."""
+    """Reason why the server sends no plan. PLANS: the server plans, and the trigger decides."""
 
     def __new__(cls, number: int, text: str = "") -> "Idle":
         made = int.__new__(cls, number)
@@ -239,7 +239,7 @@ class Time(NamedTuple):
     vehicle: int
     session: int
     step: int
-    """Step k in which the message is sent, on the vehicle's grid."""
+    """Step k in which the message is sent, by the vehicle's count."""
     epoch_us: int
     """Time stamp: the time since 1970 at which step 0 began."""
     error_us: int
@@ -354,7 +354,7 @@ def _inputs(value: object, ours: Terms) -> NDArray[np.float32]:
         raise ProtocolError(Drop.TYPE)
     most = ours.horizon + ahead_max(ours)
     inputs = _array(value, _FLOAT32, ours.axes, (ours.horizon, most))
-    largest = np.abs(inputs).max(axis=1).tolist()  # NaN if the row contains one
+    largest = np.abs(inputs).max(axis=1).tolist()  # NaN if the row contains a NaN
     if not all(map(math.isfinite, largest)):
         raise ProtocolError(Drop.NOT_FINITE)
     for most, bound in zip(largest, ours.u_max, strict=True):
@@ -431,7 +431,7 @@ _TYPES: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     7: (Trajectory, (U16, U32, U32, _STAMP, _AGE, _SPACING, knots_in, _NUMBER, U16)),
     8: (Time, (U16, U32, U32, _STAMP, U32)),
 }
-"""Message of each type number (from 1) and the check of each of its fields on the wire."""
+"""Class of the message with each type number (from 1), and a check for each of its fields."""
 _ROOMS = {9: "skytether.shared.wire.path_proof", 10: "skytether.shared.wire.lead"}
 """Modules with optional messages, by type number, imported with the first such message."""
 
@@ -471,8 +471,8 @@ def _observation_fields(sent: Observation) -> list[object]:
     number, silence, unsaved = rest
     numbers = state.ravel().tolist() + u.tolist()
     return [
-        # Steps are sent as differences, mode and flags as one number: usually one byte each, not up
-        # to five.
+        # Steps are sent as differences, and mode and flags as one number, so that each usually
+        # takes one byte instead of up to five.
         VERSION,
         _OBSERVATION,
         vehicle,

@@ -6,9 +6,9 @@
     telemetry  messages made from a flight
     faults     faults at times counted from arming
 
-`skytether autopilot` runs it, for tests and for users without an autopilot. Its response to
-velocities, lost set-points, refused commands and landings was measured on both autopilots in
-simulation; behaviour that Skytether does not depend on is left out. The package imports
-`skytether.mavlink`, `quadrotor` and `shared`; only `__main__` imports the shell. The client never
-imports the package.
+`skytether autopilot` runs the simulated autopilot, for tests and for users without an autopilot.
+Responses to velocities, lost set-points, refused commands and landings were measured on both
+autopilots in simulation; behaviour that Skytether does not depend on is left out. The package
+imports `skytether.mavlink`, `quadrotor` and `shared`; only `__main__` imports the shell. The client
+never imports the package.
 """

@@ -35,8 +35,8 @@ class AutopilotOptions(ProcessOptions):
     flavour: FlavourName = "ardupilot"
     """Autopilot to simulate: ArduCopter 4.5 or PX4 1.17."""
     bind: str | None = None
-    """HOST:PORT to receive MAVLink at; by default 127.0.0.1:14550, or a free port with --to. The
-    autopilot answers each sender.
+    """HOST:PORT at which MAVLink is received; by default 127.0.0.1:14550, or a free port with --to.
+    The autopilot answers each sender.
     """
     to: str | None = None
     """HOST:PORT to which heartbeats are sent from the start, for a companion computer that waits
@@ -55,7 +55,7 @@ class AutopilotOptions(ProcessOptions):
             "silence@20-25: the autopilot sends nothing for 5 s; pilot@20: a pilot takes over; "
             "disarm@20: its rotors stop; battery@20: 5 percent of the charge are left; "
             "estimate@20-25: it has no position estimate; "
-            "drift@20-25: its accelerometers fail, it drifts, but its estimate stays; "
+            "drift@20-25: its accelerometers fail, and it drifts without noticing; "
             "commander@20-25: a second station commands 3 m/s north, 50 times a second; "
             "leap@20: the position that it reports leaps by 12 m; "
             "shift@20: its receiver's position shifts by 3 m; fix@20: its receiver has no fix.",

@@ -63,7 +63,7 @@ class Peer:
 
     Args:
         pinned: whether the peer is kept even if it is silent for long.
-        rates: initial rates of its streams [Hz], by message id.
+        rates: initial rates of the peer's streams [Hz], by message id.
         now_ns: time now, on the autopilot's clock.
     """
 
@@ -161,7 +161,7 @@ class Autopilot(Endpoint):
         messages = self._reader.decode(datagram.payload)
         peer = self._peers.get(datagram.peer)
         for message in messages:
-            if message.get_srcSystem() == SYSTEM:  # an echo, or another system with the same id
+            if message.get_srcSystem() == SYSTEM:  # an echo, or from a system with the same id
                 self._counts["foreign"] += 1
                 continue
             peer = peer or self._meet(datagram.peer)
@@ -226,7 +226,7 @@ class Autopilot(Endpoint):
             self._recorder.append_row(time_ns, x, vx, y, vy, z, vz)
 
     def _meet(self, address: Address, *, pinned: bool = False) -> Peer | None:
-        """Add a peer; None if PEERS_MAX are active."""
+        """Add a peer, and return it; None if PEERS_MAX peers are active."""
         now_ns = self.flight.now_ns
         if len(self._peers) == PEERS_MAX:
             others = [peer for peer in self._peers.values() if not peer.pinned]
@@ -360,7 +360,7 @@ class Autopilot(Endpoint):
         return result
 
     def _set_interval(self, number: int, interval_us: float, peer: Peer) -> Result:
-        """Set the interval of a peer's stream; 0 restores the default, a negative one stops it."""
+        """Set the interval of a peer's stream; 0 restores the default, below 0 stops the stream."""
         if number not in STREAMS or not isfinite(interval_us):
             return Result.DENIED
         if number == HEARTBEAT and self._flavour.fixed_heartbeats:

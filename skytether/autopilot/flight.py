@@ -194,7 +194,7 @@ class PilotedVehicle(ABC):
         return Result.ACCEPTED
 
     def disarm(self, *, force: bool = False) -> Result:
-        """Disarm; in the air only if forced."""
+        """Disarm. In the air the vehicle disarms only with `force`."""
         if self.flying and not force:
             return self.refusal
         if self.armed:
@@ -474,7 +474,7 @@ class PilotedVehicle(ABC):
             self._wander[:] = 0.0
 
     def _follow_receiver(self) -> None:
-        """Advance by a tick the errors of the estimate that the receiver causes."""
+        """Advance by one tick the estimate's errors that come from the receiver."""
         self._past.append((self.quadrotor.position(), self.quadrotor.velocity()))
         dt = TICK_NS / SECOND_NS
         if not self.fixes:

@@ -96,7 +96,7 @@ class PX4(PilotedVehicle):
         return ""
 
     def forget(self) -> None:
-        """Do nothing: PX4 keeps the set-points that arrived before it entered OFFBOARD."""
+        """Do nothing, because PX4 keeps the set-points that arrived before it entered OFFBOARD."""
 
     def mode_number(self, main: int, sub: int) -> int:
         return main << 16 | max(sub, 0) << 24
@@ -150,7 +150,7 @@ class PX4(PilotedVehicle):
         return (self.now_ns - setpoint.came_ns) / SECOND_NS
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """Leave OFFBOARD after COM_OF_LOSS_T without set-points."""
+        """Leave OFFBOARD after COM_OF_LOSS_T without set-points; return whether PX4 has left it."""
         if self._past_s(setpoint) <= self.parameters["COM_OF_LOSS_T"] + SILENCE_LAG_S:
             return False
         value = int(self.parameters["COM_OBL_RC_ACT"])

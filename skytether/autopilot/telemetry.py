@@ -22,11 +22,11 @@ SENSORS = int(
 )
 """Sensors whose health SYS_STATUS reports."""
 KNOWS_ALL, KNOWS_ATTITUDE = 831, 167
-"""Status flags of an estimate with a position, and without, as sent by ArduPilot and PX4."""
+"""Status flags of an estimate with and without a position, as ArduPilot and PX4 send them."""
 UNKNOWN_MV = 65535
 """Voltage sent for a missing cell [mV]."""
 CURRENT_MODE_EXTRA = 193
-"""Byte of the type CURRENT_MODE that enters its checksum (CRC_EXTRA)."""
+"""CRC_EXTRA of CURRENT_MODE: the byte of this message type that enters the checksum."""
 
 
 class CurrentMode:
@@ -198,7 +198,7 @@ class Telemetry:
         )
 
     def estimate(self) -> Message:
-        """State of the position estimate, in the flavour's message."""
+        """State of the position estimate, in the message that this autopilot uses."""
         knows = KNOWS_ALL if self._flight.ready else KNOWS_ATTITUDE
         if self._flight.flavour.bytewise:
             return dialect.MAVLink_estimator_status_message(

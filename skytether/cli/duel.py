@@ -34,8 +34,8 @@ from skytether.view.frames import of_flight
 @dataclass(frozen=True)
 class DuelOptions:
     scenarios: Annotated[tuple[str, ...], Argument(positional=True, metavar="SCENARIO")]
-    """Two or more names of scenarios (`skytether list scenarios`) or .toml files; the others
-    take the network, duration and seed of the first.
+    """Two or more names of scenarios (`skytether list scenarios`) or .toml files. All are flown
+    with the network, duration and seed of the first.
     """
     duration: float | None = None
     """Length of the flights [s]; by default the first scenario's."""

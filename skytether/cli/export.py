@@ -28,8 +28,8 @@ class ExportOptions:
     parquet: Path | None = None
     """Folder for the tables as Parquet; needs pyarrow."""
     traces: Path | None = None
-    """Folder for traces of netem's effect on packets, one file per direction, flow and path, which
-    `trace(FILE)` replays; see docs/network.md.
+    """Folder for traces of netem's effect on packets, one file per direction, flow and path. The
+    impairment `trace(FILE)` replays a trace; see docs/network.md.
     """
     pcap: Path | None = None
     """File for a packet capture (pcap) of netem's output, with true lengths, but made-up headers
@@ -79,7 +79,7 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
             _write(options.traces / f"{name}.csv", trace.encode())
     if options.pcap:
         counted = recorded.figures.get("netem", {})
-        header_bytes = counted.get("header_bytes", HEADER_BYTES)  # only `netem run` records it
+        header_bytes = counted.get("header_bytes", HEADER_BYTES)  # of `netem run`, else missing
         _write(options.pcap, traffic.pcap(packets, header_bytes=header_bytes))
 
 

@@ -65,11 +65,11 @@ class FlyOptions(ScenarioOptions):
     """Encrypt and authenticate the link, with keys made for this flight. Without --secure, packets
     on loopback are plaintext."""
     standby: bool = False
-    """Fly with a standby server, which takes over when the first server is silent: starts two more
-    processes, `server 2` and its netem. The flight goes on if one server ends.
+    """Fly with a standby server, which takes over when the first server is silent. Two more
+    processes are started, `server 2` and its netem. The flight goes on if one server ends.
     """
     virtual: bool = False
-    """Fly in virtual time: the same code in one process, reproducible, many times faster."""
+    """Fly in virtual time: the same code runs in one process, many times faster, reproducibly."""
     set_parameters: bool = False
     """Set the autopilot's parameters to values that are safe if set-points stop. Without
     --set-parameters, unsafe values are only reported, and the vehicle is not armed.
@@ -243,7 +243,7 @@ def _summarise(scenario: Scenario, name: str, flown: Record, *, secure: bool = F
 def _virtually(
     options: FlyOptions, on_second: Callable[[float], None], interrupted: Callable[[], bool]
 ) -> tuple[Record, str | None]:
-    """Fly in virtual time; returns the flight, and the error of its recording or None."""
+    """Fly in virtual time. Returns the flight, and the error of its recording or None."""
     scenario, secure = options.config, options.secure
     flown = flight.fly(
         scenario,
@@ -270,7 +270,7 @@ def _really(
     on_second: Callable[[float], None],
     interrupted: Callable[[], bool],
 ) -> tuple[Record, str | None]:
-    """Fly over UDP; returns the flight, and the error of its recording or None."""
+    """Fly over UDP. Returns the flight, and the error of its recording or None."""
     scenario, name, secure = options.config, options.scenario, options.secure
     with ExitStack() as stack:
         live = None

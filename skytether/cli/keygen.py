@@ -29,11 +29,11 @@ class KeygenOptions:
     number: Annotated[int, Argument(name="id", metavar="ID")] = 1
     """Number of the first vehicle (0 to 65535); the others follow."""
     key_id: Annotated[int | None, Argument(metavar="K")] = None
-    """Number of the new keys (0 to 255); by default the vehicle's highest number plus 1, and 1 for
-    its first key.
+    """Number of the new keys (0 to 255); by default the highest number of the vehicle's keys plus
+    1, and for a vehicle's first key 1.
     """
     add: bool = False
-    """Add to an existing file: keys of more vehicles, or the next key of vehicles that have one."""
+    """Add keys to an existing file: keys of more vehicles, or a second key of the same vehicles."""
     if_missing: bool = False
     """Keep an existing file as it is, and exit with 0."""
 

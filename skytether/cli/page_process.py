@@ -40,7 +40,7 @@ def paged(at: str | None, folder: Path | None = None) -> Iterator[Path | None]:
 
 @contextlib.contextmanager
 def beside(folders: Sequence[Path], at: str) -> Iterator[None]:
-    """Serve a page of flights at HOST:PORT during the block; print its address or why it failed."""
+    """Serve a page of flights at HOST:PORT during the block; print its address or its error."""
     arguments = [*map(str, folders), "--page", at, "--log", "json", *plugins.flags()]
     child = subprocess.Popen(
         [sys.executable, "-P", "-m", "skytether.view.browser", *arguments],

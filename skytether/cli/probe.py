@@ -238,8 +238,8 @@ def _probe(options: ProbeOptions, names: Sequence[str], paths: Sequence[NetworkP
 
 
 def _links(options: ProbeOptions, count: int) -> Sequence[ClientLink]:
-    """Links of the paths. Each path uses another vehicle's key, because the gate keeps one channel
-    per vehicle.
+    """Links of the paths. Each path uses another vehicle's key, because the listening end keeps one
+    channel per vehicle.
     """
     if not options.keys:
         return [PlainLink() for _ in range(count)]

@@ -226,7 +226,7 @@ def run(
     Args:
         parts: the folder. Each process writes its record there and, as `.json`, its figures.
         on_second: called with the time flown [s], several times a second.
-        interrupted: called several times a second; once true, the flight ends in order.
+        interrupted: called several times a second; once it returns True, the flight ends in order.
         on_event: called with each line of the processes' logs.
         vehicles: number of vehicles, all in one process.
         workers: number of processes of the server.

@@ -66,7 +66,7 @@ def _about(
 
 
 def beside() -> int:
-    """Record a process's feed until stdin ends; stdin begins with a `RecorderOrder`."""
+    """Record a process's feed, as the `RecorderOrder` on stdin says, until stdin ends."""
     order = msgspec.json.decode(sys.stdin.buffer.readline(), type=RecorderOrder)
     plugins.load(order.plugins)
     scenario = checked(toml.loads(order.scenario), any_network=True)

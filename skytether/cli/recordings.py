@@ -12,7 +12,7 @@ def opened(path: Path) -> Recorded:
 
     Raises:
         CommandError: the file cannot be read.
-        RecordingError: it is not a recording, or damaged.
+        RecordingError: the file is not a recording, or is damaged.
     """
     try:
         recorded = read(path)

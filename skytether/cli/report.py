@@ -50,7 +50,7 @@ def report(argv: Sequence[str]) -> None:
 
 
 def _explanation(file: Path) -> str:
-    """Explanation of a recording as `skytether explain` prints it; same errors."""
+    """Explanation of a recording as `skytether explain` prints it, with the same errors."""
     module, _, name = COMMANDS["explain"].partition(":")
     explain = getattr(import_module(module), name)
     with redirect_stdout(StringIO()) as printed:

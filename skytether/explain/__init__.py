@@ -1,8 +1,8 @@
 """Explain: why a flight braked, was far off, came too close, or sent too much.
 
 A flight in virtual time is the same to the last bit each time, and the loss and delay of a packet
-follow from seed, direction, flow and time. So the same flight can be flown again without one
-outage, one loss, the wind, or with another key, to see whether the moment occurs again.
+follow from seed, direction, flow and time. So the same flight can be flown again without an outage,
+a loss or wind, or with another key, to see whether it goes wrong again at the same moment.
 
     skytether explain demo-two-links --seed 9314
 

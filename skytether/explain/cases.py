@@ -140,7 +140,7 @@ class FlightCase:
         return Fates(getattr(own, name), own.seed, name, flow)
 
     def flown(self) -> Scenario:
-        """Scenario with the changes; raises ConfigError if it cannot be flown."""
+        """Scenario with the case's changes; raises ConfigError if it cannot be flown."""
         scenario = self.scenario
         if self.keys:
             table = reading.to_table(scenario)

@@ -50,7 +50,7 @@ class CausePart:
     error_m: float
     """Largest error without this unit [m]."""
     calm_m: float = np.nan
-    """Largest error without this unit and wind [m]; NaN except for a real vehicle's double."""
+    """Largest error without this unit, wind and model errors [m]; NaN unless a real vehicle flew."""
     packets: int = 0
     """Number of packets that the unit lost or delayed."""
     plans: int = 0
@@ -215,7 +215,7 @@ WHAT = {
 
 
 def named(unit: Unit) -> str:
-    """Noun for a unit, without article."""
+    """Noun for a unit, without an article."""
     match unit:
         case Setting():
             return unit.name
