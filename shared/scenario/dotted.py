@@ -33,7 +33,7 @@ def set_keys(changes: Mapping[str, Any], table: dict[str, Any]) -> None:
         network = table.get("network")
         paths = network.get("paths") if isinstance(network, dict) else None
         if paths and text_key(path) in ("network.uplink", "network.downlink"):
-            raise ConfigError(f"{path}: got {value!r}, expected network.paths: there are several")
+            raise ConfigError(f"{path}: got {value!r}, expected a value per path in network.paths")
         *sections, key = path.split(".")
         section: Any = table
         for depth, name in enumerate(sections):

@@ -333,7 +333,7 @@ class PluginTable(dict[str, Entry]):
         other = super().get(name)
         source = self._modules.get(name) if other is _OFFERED else other and other.source
         if source and source != make.__module__:
-            raise ConfigError(f"{what}: expected another name, {source} has one of this name")
+            raise ConfigError(f"{what}: expected another name: {source} has an entry of this name")
         if lacking := sorted(getattr(make, "__abstractmethods__", ())):
             raise ConfigError(f"{what}: expected the methods {', '.join(lacking)}, too")
         passed = self._class if isinstance(make, type) else self._given

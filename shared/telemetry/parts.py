@@ -28,7 +28,7 @@ def columns_of(descr: Any) -> np.dtype[np.void]:
     except TypeError as error:
         raise ValueError(str(error)) from None
     if not columns.itemsize:
-        raise ValueError("there are none")
+        raise ValueError("the description is empty")
     return columns
 
 

@@ -123,7 +123,7 @@ def parse(name: str, content: bytes) -> Keyring:
             raise ConfigError(f"{where}: got the secret of line {before}, expected another")
         counts[key.vehicle] = counts.get(key.vehicle, 0) + 1
         if counts[key.vehicle] > KEYS_MAX:
-            expected = f"expected at most {KEYS_MAX}, the present one and the next"
+            expected = f"expected at most {KEYS_MAX}, the present and the next"
             raise ConfigError(f"{where}: one more key of vehicle {key.vehicle}, {expected}")
         keys[entry] = key
     if not keys:

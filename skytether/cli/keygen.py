@@ -96,7 +96,7 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
     what = f"{present.name}: vehicle {vehicle}"
     if len(numbers) == KEYS_MAX:
         raise CommandError(
-            f"{what} has {KEYS_MAX} keys, expected 1: delete the line of the old one first",
+            f"{what} has {KEYS_MAX} keys, expected 1: delete the old key's line first",
             CONFIGURATION,
         )
     number = asked
@@ -104,7 +104,7 @@ def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
         number = numbers[-1] + 1 if numbers else 1
     if number in numbers:
         raise CommandError(
-            f"--key-id: got {number}, expected another: {what} has it", CONFIGURATION
+            f"--key-id: got {number}, expected another number: {what} has it", CONFIGURATION
         )
     if number not in NUMBERS:
         raise CommandError(

@@ -190,7 +190,7 @@ def test_keygen_adds_the_next_key_and_no_third(tmp_path: Path) -> None:
     run = keygen("k", "--add", "--id", "4", cwd=tmp_path)
     assert run.returncode == 2
     assert run.stderr == (
-        "keygen: k: vehicle 4 has 2 keys, expected 1: delete the line of the old one first\n"
+        "keygen: k: vehicle 4 has 2 keys, expected 1: delete the old key's line first\n"
     )
     assert path.read_bytes() == content
 
@@ -209,7 +209,7 @@ def test_keygen_adds_the_next_key_and_no_third(tmp_path: Path) -> None:
         (["new", "--key-id", "256"], "--key-id: got 256, expected 0 to 255"),
         (
             ["k", "--add", "--id", "4", "--key-id", "255"],
-            "--key-id: got 255, expected another: k: vehicle 4 has it",
+            "--key-id: got 255, expected another number: k: vehicle 4 has it",
         ),
         (
             ["k", "--add", "--id", "4"],

@@ -420,7 +420,7 @@ WRONG = {
     ),
     "a name of ours": (
         "@trigger\ndef silence(now):\n    return now\n",
-        f"policy silence: expected another name, {OURS} has one of this name",
+        f"policy silence: expected another name: {OURS} has an entry of this name",
     ),
     "a text": (
         "@trigger\ndef slip(now, how: str):\n    return now\n",
@@ -480,7 +480,7 @@ def test_two_files_cannot_have_one_name(tmp_path: Path) -> None:
     """A file that is imported again, with other content, replaces itself."""
     one = plug(tmp_path, NEVER, "one.py")
     said = refusal(lambda: plug(tmp_path, NEVER, "two.py"))
-    assert said.endswith(f"policy never: expected another name, {one} has one of this name")
+    assert said.endswith(f"policy never: expected another name: {one} has an entry of this name")
     plug(tmp_path, NEVER.replace("never", "rarely"), "one.py")
     assert "never" not in TRIGGERS
     assert TRIGGERS["rarely"].source == one
