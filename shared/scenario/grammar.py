@@ -47,9 +47,9 @@ class GrammarError(Exception):
 class Call:
     name: str
     values: tuple[Value, ...] = ()
-    """Arguments as written; after `PluginTable` has bound the call, one for each parameter."""
+    """Arguments as written; after `PluginTable` has bound the call, one value per parameter."""
     keys: tuple[str, ...] = ()
-    """Name of each argument, empty for a positional one; no names after binding."""
+    """Name of each argument, empty for a positional argument. After binding: empty tuple."""
     text: str = field(default="", compare=False)
     begin: int = field(default=0, compare=False)
     """Index of the call's first character in the text."""

@@ -30,8 +30,8 @@ class TooFast(NamedTuple):
 
 
 def is_known(scenario: Scenario) -> bool:
-    """Whether the desired trajectory is known before the flight, as it is except for a live point,
-    a target and a mission.
+    """Whether the desired trajectory is known before the flight. Those of a live point, of a target
+    and of a mission are unknown.
     """
     return scenario.reference.shape not in ("live", "target") and not scenario.keeps_apart
 

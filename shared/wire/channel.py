@@ -1,4 +1,4 @@
-"""Channel: encrypted packets in both directions after one handshake, each opened at most once.
+"""Channel: encrypted packets in both directions after a handshake. No packet is opened twice.
 
     DATA    version u8 | type u8 | vehicle u16 | channel u32 | counter u64 | sealed message
 

@@ -59,7 +59,7 @@ NO_FEEDBACK = np.empty((0, 0), np.float32)
 FLOAT_MAX = float(np.finfo(np.float32).max)
 """Largest number that fits in a state on the wire [m, m/s]."""
 NO_INPUT = np.empty(0)
-"""Value of `Observation.input` with the scheme "trajectory", which does not use it."""
+"""Value of `Observation.input` with the scheme "trajectory", which does not use the input."""
 
 INPUT_TOLERANCE = 1.001
 """Factor by which an input may exceed its bound before the packet is refused, because of float32

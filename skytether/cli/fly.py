@@ -43,7 +43,7 @@ from skytether.shell.processes import pool
 from skytether.sim import flight
 
 UNSEEN = Fault, ReferenceTooFast
-"""Events of a flight in virtual time that are printed after it."""
+"""Events of a flight in virtual time that are printed after the flight."""
 PRINTED = (
     *(ModeChanged, PlanningStopped, RecordIncomplete, Changed, ChangeRefused),
     *UNSEEN,

@@ -107,7 +107,7 @@ class ProbeOptions:
 
 
 def probe(argv: Sequence[str]) -> None:
-    """Measure a path over UDP: delays each way, loss, bursts, reordering, rate; fit models.
+    """Measure delays, loss, bursts, reordering and rate of a path over UDP, and fit models.
 
     One end listens and answers; the other end sends numbered packets and prints the results. If the
     listener runs at the server's place and the sender on the vehicle, the packets measure the

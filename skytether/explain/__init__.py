@@ -15,12 +15,12 @@ The modules, in the order of their use:
 |---|---|
 | `cases` | a flight that is to be flown, and the units that can be removed from it |
 | `flying` | `fly(case) -> CaseOutcome`, the only function that flies; can run in a worker process |
-| `moments` | what went wrong, beside the same flight over a perfect network |
+| `moments` | what went wrong, compared with the same flight over a perfect network |
 | `units` | what the network did: outages, packets lost or late; and wind, noise, a stall |
 | `doubles`, `doubled` | a recorded flight over UDP, made a case that can be flown in virtual time |
 | `smallest` | delta debugging: the smallest set of units that suffices |
 | `causes` | the cause, packets that alone would avert the moment, shortest sufficient outages |
-| `remedies` | other keys, over the same network and with other seeds |
+| `remedies` | changes of keys that help, over the same network and with other seeds |
 | `explanation` | the whole explanation, step by step |
 | `words`, `picture` | the explanation as text and as a picture |
 | `command` | the command, the only module with processes, files and the terminal |

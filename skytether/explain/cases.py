@@ -70,7 +70,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Stall:
-    """Time for which a process is stopped: it receives no packets and is not woken."""
+    """Time for which a process is stopped: the process receives no packets and is not woken."""
 
     process: Literal["server", "client"]
     at_s: float

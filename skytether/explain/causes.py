@@ -50,7 +50,7 @@ class CausePart:
     error_m: float
     """Largest error without this unit [m]."""
     calm_m: float = np.nan
-    """Largest error without this unit, wind and model errors [m]; NaN unless a real vehicle flew."""
+    """Largest error without this unit, wind and model errors [m]; only for a real vehicle."""
     packets: int = 0
     """Number of packets that the unit lost or delayed."""
     plans: int = 0
@@ -66,7 +66,7 @@ class Cause:
     parts: tuple[CausePart, ...]
     """Units of the cause; empty if the scenario itself is the cause."""
     since_s: float
-    """Time of flight at which the search for units began [s]."""
+    """Time of flight from which on units were examined [s]."""
     among: int
     """Number of units that were examined."""
     error_m: float
