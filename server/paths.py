@@ -1,7 +1,7 @@
-"""Paths from the server to a vehicle: its proven addresses, and the datagrams sent to each.
+"""Paths from the server to a vehicle: the vehicle's addresses, and the datagrams sent to each.
 
 `RoutesOverPaths` replaces `server.routes.Routes` at the first report of a vehicle with several
-paths (`server.reception`); a server in real time loads it before its first packet.
+paths (`server.reception`); a server in real time loads this module before its first packet.
 """
 
 import hashlib
@@ -35,9 +35,9 @@ from skytether.shared.wire.protocol import (
 
 CLOSE, PLANS = number_of(Close), (number_of(Horizon), number_of(Trajectory))
 PLACES = 2
-"""Number of addresses of a path that are in use at once."""
+"""Largest number of addresses of a path that are in use at once."""
 FORMER_NS = 2 * SECOND_NS
-"""Time after a former address's last packet for which packets are also sent there [ns]."""
+"""Time for which packets are still sent to a former address after its last packet [ns]."""
 
 
 class Place(NamedTuple):
@@ -50,13 +50,13 @@ class Place(NamedTuple):
 class ServerPaths:
     """Paths of one session.
 
-    A path is used once the vehicle has returned, from the path's address, a number that was sent
-    only there: an attacker at another address, who copies packets, cannot. As with a cookie, the
-    number is computed from the address and a secret, so questions are not stored.
+    A path is used once its address is proven: the server sends a number to the address, and the
+    vehicle returns the number from there. An attacker elsewhere who copies packets cannot do so.
+    The number is computed from the address and a secret, like a cookie, so no request is stored.
 
-    An attacker who forwards copies in both directions can: then the attacker's address is proven as
-    well. So the former address of a path stays in use while packets still come from it, and the
-    path works on when the attacker stops.
+    An attacker who forwards copies in both directions can prove an address of its own. So the
+    former address of a path stays in use while packets still come from there, and the path still
+    works after the attacker stops.
 
     Args:
         spread: `link.spread`.
@@ -79,7 +79,7 @@ class ServerPaths:
         """Cost of losing the next plan, in units of the price of a packet."""
 
     def number(self, place: Place) -> int | None:
-        """Number of the path with a proven address; None if there is none."""
+        """Number of the path that the address is proven for; None if the address is not proven."""
         return next((path for path, places in self._places.items() if place in places), None)
 
     def hear(self, place: Place, now_ns: int) -> int | None:
@@ -100,7 +100,7 @@ class ServerPaths:
             self.paths.set_prices(prices)
 
     def prove(self, message: PathProof, place: Place, now_ns: int) -> PathProof | None:
-        """Request for a proof to an address that names a path; None if the address is proven."""
+        """Request for a proof of the address of a message; None if the address is proven."""
         path = message.path
         if path >= len(self.paths.each) or place in self._places.get(path, ()):
             return None
@@ -113,7 +113,7 @@ class ServerPaths:
         return None
 
     def question(self, vehicle: int, session: int, place: Place, path: int = 0) -> PathProof:
-        """Request for a proof of the address `place`; `path` may be 0: the vehicle knows it."""
+        """Request for a proof of the address `place`; the vehicle's answer names the path."""
         return PathProof(vehicle, session, path, self._proof(place), self.prices)
 
     def _proof(self, place: Place) -> int:
@@ -133,8 +133,8 @@ class ServerPaths:
     def watched(
         self, vehicle: int, session: int, line: ReplyPath, silence_ns: int, now_ns: int
     ) -> list[Datagram]:
-        """Datagrams that are due: the newest one again if it was lost, and a probe on each path
-        that was not used for long.
+        """Datagrams that are due: the newest datagram again if it was lost, and a probe on each
+        path that has been unused for long.
         """
         due = []
         if resent := self.paths.again(silence_ns, now_ns, sorted(self._places)):
@@ -168,7 +168,7 @@ class ServerPaths:
         return [*chain.from_iterable(self._to(path, datagram, now_ns) for path in on)]
 
     def _to(self, path: int, datagram: bytes, now_ns: int) -> list[Datagram]:
-        """Datagrams to a path's newest address, and to the former one while it sends packets."""
+        """Datagrams to a path's newest address, and to the former one if it still sends."""
         places = self._places[path]
         newest = next(reversed(places))
         return [
@@ -183,7 +183,7 @@ class ServerPaths:
 
 
 class RoutesOverPaths(Routes):
-    """Routes to vehicles of which some have several paths.
+    """Routes to vehicles, some of which have several paths.
 
     Args:
         entropy: returns this many random bytes.
@@ -255,7 +255,7 @@ class RoutesOverPaths(Routes):
             self.forget(session)
 
     def restart(self, session: Session) -> None:
-        """Note that a client, which keeps its session, may have restarted."""
+        """Note that a client may have restarted and kept its session."""
         if paths := _paths(session):
             paths.paths.peer_may_restart = True
 

@@ -3,7 +3,7 @@
 Each is compared with the vehicle's last accepted observation:
 
     clock     with the delay of the other direction, its delay must give a round trip of at least 0
-    horizon   the horizon in force, and its first flown step, must advance with time, no faster
+    horizon   the horizon in force, and its first flown step, must not go back nor lie in the future
     jump      position and velocity must change by no more than a vehicle can fly
 
 An observation that fails is dropped and counted. In case the last accepted observation was wrong,
@@ -124,7 +124,7 @@ def _against(
         drift = int(abs(new.step - before.step) * dt * SECOND_NS) // DRIFT
         if min(trip, new.forward + new.backward) < -SLACK_NS - drift:
             verdict = CLOCK
-        elif new.step > before.step:  # only the clocks can be checked in any order of steps
+        elif new.step > before.step:  # horizon and jump need the newer step
             back = new.in_force < before.in_force or new.since < before.since
             if new.in_force != NO_HORIZON and back:
                 verdict = HORIZON

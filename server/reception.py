@@ -1,4 +1,4 @@
-"""The server's side of the conversation: receives messages, checks and answers them.
+"""Receives the messages of vehicles, checks and answers them.
 
 HELLO is answered by a WELCOME or a refusal, OBSERVATION is checked and passed to the controller,
 CLOSE ends a session, and TIME reports a vehicle's time of day. Other messages are dropped and
@@ -56,7 +56,7 @@ from skytether.shared.wire.protocol import (
 )
 
 REFUSALS_REPORTED = 64
-"""Number of stored refusals; a repeated HELLO is not reported again."""
+"""Number of stored refusals, so that the refusal of a repeated HELLO is not reported again."""
 REPORT_NS = 10 * SECOND_NS
 """Interval between reports of unauthenticated datagrams [ns]."""
 IMPLAUSIBLE: dict[int, Drop] = {
@@ -348,8 +348,8 @@ class Reception:
         error_ns = self.time and self.time.error_at(now_ns)
         if error_ns is None or self.time is None:
             return
-        # The stamp is ambiguous: choose the time closest to the estimate from delays. The error
-        # grows by the clocks' drift since the message was sent.
+        # The time stamp is modulo its range: choose the time closest to the estimate from delays.
+        # The error has grown by the clocks' drift since the message was sent.
         offset_ns, bound_ns = self._clock.middle_ns(session.row, now_ns)
         ahead_ns = self.time.ahead_ns
         epoch_ns = stamped_ns(message.epoch_us, near_ns=ahead_ns - offset_ns)

@@ -32,7 +32,7 @@ class Routes:
     """Routes to all vehicles of a server; each `session` is a `sessions.Session`."""
 
     def of_several(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> "Routes":
-        """Routes to vehicles of which some have several paths.
+        """Routes to vehicles, some of which have several paths.
 
         Args:
             entropy: returns this many random bytes.
@@ -78,7 +78,7 @@ class Routes:
         raise ProtocolError(Drop.FIELD)
 
     def narrow(self, session: Any) -> None:
-        """Note that a client has restarted with one address."""
+        """Note that a client with several paths has restarted with one address."""
 
     def restart(self, session: Any) -> None:
         """Note that a client may have restarted and continued its session."""

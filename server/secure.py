@@ -37,7 +37,7 @@ from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello
 COOKIE_NS = 60 * SECOND_NS
 """Length of a cookie's period; each cookie is valid in its period and the next one [ns]."""
 HANDSHAKES = 5
-"""Largest number of handshake attempts of a vehicle a second, and of answers to their repeats."""
+"""Largest number of a vehicle's handshake attempts per second, and of answers to repeated ones."""
 PENDING_MAX = 64
 """Largest number of pending channels of a vehicle, which uses the first RESPONSE that it receives.
 Round trips up to 12 s do not exceed this limit, even if an attacker replays the vehicle's HELLOs,
@@ -74,7 +74,7 @@ class _HandshakeRate:
 
     def __init__(self, now_ns: int) -> None:
         self._granted_ns = now_ns - SECOND_NS
-        """Virtual time of the rate limit, which a handshake advances by 1 / HANDSHAKES s [ns]."""
+        """Time until which handshakes are used up; each handshake adds 1 / HANDSHAKES s [ns]."""
 
     def grant(self, now_ns: int) -> bool:
         """Whether another handshake is granted."""

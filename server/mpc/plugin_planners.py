@@ -1,11 +1,11 @@
-"""Planners of plug-ins that replace the MPC (`shared.scenario.planners`), one per vehicle.
+"""Planners from plug-ins, one per vehicle, which replace the MPC (`shared.scenario.planners`).
 
 A planner that raises, takes too long, or returns an infeasible plan makes no plan for its vehicle
 at that step: the vehicle flies its present plan to the end, and then its failsafe acts. The caller
-of planners (`server.planning.scheme.Planning`) limits their time, because a core has no clock.
+of planners (`server.planning.scheme.Planning`) limits their time, because a scheme reads no clock.
 
-The cost that a planner optimises is unknown here. So its plan counts as the optimum, and the excess
-cost of the inputs already sent is ΔUᵀ 𝓗 ΔU of eq. (9), with their difference ΔU from the plan.
+The server does not know which cost a planner optimises. So the planner's plan counts as optimal:
+the inputs already sent, which differ from the plan by ΔU, cost ΔUᵀ 𝓗 ΔU more, with 𝓗 of eq. (9).
 """
 
 from collections.abc import Callable, Sequence
@@ -29,9 +29,9 @@ from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.wire.protocol import FLOAT_MAX
 
 ERRORS, LATE, NOT_CALLED = "planner_errors", "planner_late", "planner_not_called"
-"""Names of the counts of steps without a plan, by cause."""
+"""Counts of steps without a plan: the planner failed, answered too late, or was not called."""
 EXPECTED = {TimeoutError: LATE, Full: NOT_CALLED}
-"""Name of the count to increase, by the exception of a planner that has not answered."""
+"""Count to increase for each exception that stands for a planner's missing answer."""
 
 
 @dataclass(slots=True)
@@ -39,13 +39,13 @@ class VehiclePlanner:
     """Planner of one vehicle, and its last plan."""
 
     number: int
-    """Number of the planner, unique among all planners of its row."""
+    """Number of the planner, unique within its `PluginPlanners`."""
     planner: Any
-    """The planner; None before its first plan."""
+    """The planner, or None if the first call for a plan has to make the planner."""
     inputs: Array
     """Inputs of the last plan [m/s]; shape (axes, H)."""
     start: int = -1
-    """Step at which the last plan started, or -1."""
+    """Step at which the last plan starts, or -1 before the first plan."""
 
 
 class PluginPlanners:
@@ -92,8 +92,8 @@ class PluginPlanners:
             reference: desired states from the start on [m, m/s]; shape (n, axes, H + 1, 2).
 
         Returns:
-            for each vehicle inputs within ±u_max [m/s], shape (axes, H); states [m, m/s], shape
-            (H + 1, axes, 2); or None.
+            for each vehicle one of: inputs within ±u_max [m/s], shape (axes, H); states [m, m/s],
+            shape (H + 1, axes, 2); None without a plan.
         """
         owns = [self._of(row) for row in rows.tolist()]
         calls = [
@@ -149,11 +149,11 @@ class PluginPlanners:
 
 
 class InputPlanner(Planner):
-    """Planners of plug-ins for a scheme that sends inputs, with the figures of the MPC.
+    """Planners from plug-ins for a scheme that sends inputs; computes the same figures as the MPC.
 
-    The planner's result is the generator's plan, without disturbance; the tracker's plan, which is
-    sent, is this plan minus the disturbance. The MPC's generator never uses the vehicle's state,
-    but a planner always starts from it. So triggers compare with the plan that was sent last.
+    A planner's result replaces the plan of the MPC's generator, which assumes no disturbance. The
+    plan sent is this result minus the disturbance, in place of the tracker's. Unlike the generator,
+    a planner starts from the vehicle's state. So triggers compare with the plan that was sent last.
     """
 
     def __init__(self, fleet: Fleet) -> None:

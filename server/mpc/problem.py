@@ -11,8 +11,8 @@ the target and the previous plan. W holds Q at the stages 1 … H-1 and P at H.
 The work of a step is done in O(H), by recursion along the horizon, on one axis, for several
 vehicles at once. In a recursion every stage waits about ten cycles for the previous one, and most
 of the processor is idle. So the innermost loop runs over vehicles, and the compiler turns it into
-vector instructions. A single vehicle is a batch of size 1. Vehicles are independent, and a vehicle
-gets the same bits alone as in a batch, which a BLAS product with Γ does not guarantee.
+vector instructions. A single vehicle is a batch of size 1. A vehicle's plan is the same to the last
+bit alone and in a batch; a BLAS product with Γ would not guarantee this.
 """
 
 from dataclasses import dataclass
@@ -91,7 +91,7 @@ class Problem:
     model: Model
     mpc: MPC
     which: int
-    """FIRST or LATER weights."""
+    """Weights in use: FIRST or LATER."""
     hessian: Array
     """𝓗 of each axis; shape (axes, H, H)."""
 
@@ -141,15 +141,15 @@ class SimdBatch(NamedTuple):
     p11: F1
     """Matrix P, entry of velocity; shape (L,)."""
     total: F1
-    """Sum of the gradient, as a test: finite if all its numbers are finite; shape (L,)."""
+    """Sum of the gradient's entries, which is finite only if every entry is; shape (L,)."""
     changed: F1
     """Number of inputs that entered or left the active set in the last iteration; shape (L,)."""
     active: F1
     """Number of inputs in the active set; shape (L,)."""
     worst: F1
-    """Largest violation by an input that must enter or leave the active set; shape (L,)."""
+    """Largest bound violation by an input that must enter or leave the active set; shape (L,)."""
     worst_at: F1
-    """Stage of the input in `worst`, -1 without one; shape (L,)."""
+    """Stage of the input with the violation `worst`, or -1 if there is none; shape (L,)."""
     target_p: F2
     """Desired positions at the stages 0 … H [m]; shape (H + 1, L)."""
     target_v: F2
@@ -157,9 +157,9 @@ class SimdBatch(NamedTuple):
     leader_speed: F2
     """Velocities of the plan that is tracked [m/s]; shape (H + 1, L)."""
     drift_p: F2
-    """Weighted position error without inputs, see `lead`; shape (H, L)."""
+    """Weighted position error if all inputs are 0, see `lead`; shape (H, L)."""
     drift_v: F2
-    """Weighted velocity error without inputs; shape (H, L)."""
+    """Weighted velocity error if all inputs are 0; shape (H, L)."""
     previous: F2
     """Previous plan, shifted [m/s]; shape (H, L)."""
     gradient: F2
@@ -171,7 +171,7 @@ class SimdBatch(NamedTuple):
     own: F2
     """Unconstrained choice of each stage at x = 0 [m/s]; shape (H, L)."""
     k0: F2
-    """Column K0 of the backward pass, see `exact`; shape (H, L)."""
+    """Column K0 of the backward pass, see `riccati`; shape (H, L)."""
     k1: F2
     """Column K1 of the backward pass; shape (H, L)."""
     f00: F2
@@ -181,7 +181,7 @@ class SimdBatch(NamedTuple):
 
 
 def simd_memory(H: int, width: int) -> Array:
-    """Memory of a `SimdBatch` in one array, because each array argument takes time in a call."""
+    """Memory for a `SimdBatch`: one array, because every array argument makes a call slower."""
     return np.zeros((len(SimdBatch._fields), H + 1, width))
 
 

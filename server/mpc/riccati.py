@@ -1,4 +1,4 @@
-"""Active sets of the QPs of `mpc`, by a Riccati recursion: for one vehicle, or many side by side.
+"""Active-set solver of the QPs of `problem` by Riccati recursions, for one vehicle or a batch.
 
 A condensed QP  ½ Uᵀ𝓗U + gᵀU  with 𝓗 = ΓᵀWΓ + diag(ρ) is the optimal control problem
 
@@ -7,9 +7,9 @@ A condensed QP  ½ Uᵀ𝓗U + gᵀU  with 𝓗 = ΓᵀWΓ + diag(ρ) is the opt
 So for a fixed set of inputs at their bounds, a backward pass over 2 x 2 matrices solves it in O(H),
 where a factorisation of 𝓗 takes O(H³). The forward pass gives the unconstrained choice v of each
 stage: a stage belongs to the set if v is beyond the bound. A set that reproduces itself is optimal.
-Starting from the shifted previous plan, this takes one or two iterations. The set may cycle
-instead (long steps, a tiny R, corners of the reference); then only the input with the largest
-violation changes, one per iteration. `server.mpc.exact` solves what does not converge.
+From the shifted previous plan, one or two iterations suffice. If the sets repeat in a cycle (long
+steps, a tiny R, corners of the reference), each further iteration changes only the input with the
+largest violation. `server.mpc.exact` solves the QPs for which this does not converge.
 """
 
 from typing import NamedTuple
@@ -22,7 +22,7 @@ from skytether.shared.base.kernel import B1, F1, F2, F3, F4, inline, kernel, lan
 from skytether.shared.law.model import Axis
 
 NEAR = 1.0 - 1e-6
-"""Share of the bound above which a guessed input, rounded to float32, counts as bounded."""
+"""Share of the bound above which a guessed input, rounded to float32, counts as at its bound."""
 
 ROUNDS_MAX = 8
 """Number of iterations in which the whole set may change; recorded flights needed five at most."""
@@ -171,7 +171,7 @@ def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
 
 @lanes
 def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
-    """Forward pass: unconstrained choices change the active set; `singly`: by one input only."""
+    """Forward pass: update the active set; if `singly`, only find the input to change most."""
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1, x0, x1 = model.b0, model.b1, simd.leader_p, simd.leader_v
     u, side, own, changed, active = simd.inputs, simd.side, simd.own, simd.changed, simd.active
@@ -228,8 +228,8 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
 
     Args:
         which: FIRST or LATER weights.
-        simd: input: gradient, and the previous plan, with whose active set the iteration starts;
-            output: inputs [m/s].
+        simd: reads the gradient and the previous plan, whose active set is the first guess; writes
+            the inputs [m/s].
         free: `RiccatiWorkspace.free`.
         settled: set to False for a vehicle without a solution; shape (L,).
 
@@ -247,7 +247,7 @@ def active_sets(mpc: MPC, axis: int, which: int, simd: SimdBatch, free: F4, sett
             _forward(mpc, axis, simd, singly)
         else:
             _round_free(mpc, axis, simd, free[which, axis])
-        # A correct set is reproduced exactly.
+        # The optimal set does not change.
         if not _any(changed):
             break
         if singly:

@@ -1,13 +1,13 @@
 """Clock map: present step of each vehicle, from the server's clock and the vehicle's time stamps.
 
-Neither clock is adjusted; the vehicle's clock counts from its step 0. Every observation gives F =
-t2 - t1 (sent by the vehicle, received by the server), and contains G = t4 - t3 (sent by the server,
-received aboard) of the server's newest packet. Over the last 20 s
+Neither clock is adjusted; the vehicle's clock counts from its step 0. Every observation gives F,
+its reception time (server) minus its sending time (vehicle), and contains G, the reception time
+(vehicle) minus the sending time (server) of the server's newest packet. Over the last 20 s
 
     offset = (min G - min F) / 2,    bound = (min F + min G) / 2
 
-of the vehicle's clock minus the server's. It cannot be measured whether the two smallest delays are
-equal: the offset may be wrong by up to the bound. Step k begins at k Δt of the vehicle.
+where the offset is the vehicle's clock minus the server's, and the bound is its largest error:
+whether the two smallest delays are equal is unknown. Step k begins at k Δt of the vehicle.
 
 Independently of this estimate there are two bounds that hold for any delays. A delay is never
 negative, so the true offset O is at least -F and at most G at the time of each sample, and changes
@@ -39,7 +39,7 @@ BUCKET_NS = SECOND_NS // 2
 BUCKETS = 40
 RECENT = 3
 """Number of newest intervals that count as recent when looking for a step of a clock. If they hold
-fewer than STEP_SAMPLES, because a vehicle reports rarely, more are used, up to OLD."""
+fewer than STEP_SAMPLES samples, since the vehicle reports rarely, up to OLD intervals count."""
 OLD = 8
 """Age of the minima of F and G with which recent minima are compared [intervals]."""
 STEP_SAMPLES = 5
@@ -49,7 +49,7 @@ STEP_NS = 40 * MILLISECOND_NS
 direction and lowers that of the other direction by as much."""
 
 ECHOES = 4
-"""Number of newest echoes stored per vehicle, for the estimate of the present delay to it."""
+"""Number of newest G stored for each vehicle, to estimate the present uplink delay."""
 
 # 2 * UNSEEN fits in an int64, so sums of two minima need no check.
 UNSEEN = 2**61
@@ -57,7 +57,7 @@ UNSEEN = 2**61
 
 
 class Contradiction(IntEnum):
-    """Earlier bound of a clock offset that a sample contradicts."""
+    """Source of the earlier bound of a clock offset that a new sample contradicts."""
 
     NOTHING = 0
     CLOCK = 1
@@ -115,9 +115,9 @@ FORGOTTEN = ("newest", "heard", "echoes", "adopted", "sent", "echo")
 
 class StepError(NamedTuple):
     early: float
-    """Largest number of steps by which the vehicle may be ahead of the counted step."""
+    """Number of steps that the vehicle may be ahead of the step number by the server's count."""
     late: float
-    """Largest number of steps by which the vehicle may be behind the counted step."""
+    """Number of steps that the vehicle may be behind the step number by the server's count."""
 
 
 EXACT = StepError(0.0, 0.0)
@@ -142,8 +142,8 @@ class Seen(NamedTuple):
 class ClockMap:
     """Clock offsets and present steps of up to `capacity` vehicles.
 
-    The offset in use follows the estimate only when it has moved by more than half a step: a step
-    index that alternates at a boundary would skip and repeat steps needlessly.
+    The offset in use is set to the estimate only when the two differ by more than half a step.
+    Otherwise the step number could alternate at a boundary, and steps would be skipped or repeated.
 
     Args:
         asymmetry_ns: bound on the difference of the smallest delays of the two directions over 20 s
@@ -203,8 +203,8 @@ class ClockMap:
             backward_ns: G [ns].
             heard: number of the server's packet that G belongs to.
             now_ns: server's time of reception [ns].
-            is_newest: whether the observation is the newest; the reception time of an echo in an
-                older one is unknown.
+            is_newest: whether the observation is the vehicle's newest; the age of the G in an older
+                observation is unknown.
         """
         sample = forward_ns, backward_ns, heard, is_newest, self._asymmetry_ns, now_ns
         return Contradiction(_observe(self.seen, row, *sample))
@@ -243,7 +243,7 @@ class ClockMap:
         return {"clock_steps": steps} if steps else {}
 
     def step_errors(self, rows: Indices, steps: Indices, early: Array, late: Array) -> None:
-        """Fill in `StepError` of the latest counted steps, at `rows` of two arrays (capacity,)."""
+        """Fill in the `StepError` of the latest step numbers, at `rows` of `early` and `late`."""
         _step_errors(self.seen, rows, steps, self.tick_ns, self._dt_ns, early, late)
 
     def bound_ns(self, row: int) -> int:
@@ -274,7 +274,7 @@ def half_trip_ns(seen: Seen, row: int) -> int:
 
 @part
 def shortest_ns(seen: Seen, row: int) -> int:
-    """Shortest estimated uplink delay of the newest ECHOES packets [ns]; negative if fewer came."""
+    """Shortest estimated uplink delay of the newest ECHOES packets [ns]; negative with fewer G."""
     return least(seen.echoes[row]) - seen.vehicles[row]["adopted"]
 
 
@@ -311,7 +311,7 @@ def _bounds(seen: Seen, row: int, now: int, bounds: I1) -> None:
 
 @part
 def _narrow(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
-    """Narrow the bounds by settings and time of day [ns]; if contradictory, reset them: False."""
+    """Narrow the bounds by settings and time of day [ns]; reset them and return False if empty."""
     vehicle = seen.vehicles[row]
     other_low, other_high = _by_others(seen, row, now)
     trip_low, trip_high = _by_delays(seen, row, now)
@@ -365,15 +365,15 @@ def _bound(
     """Narrow the bounds of a clock offset by F and G [ns]; returns a `Contradiction`."""
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
-    # An echoed packet arrived aboard after the previous observation was sent, which did not echo
-    # it. The first echo, or that of an overtaken observation, is at most SESSION_NS old.
+    # A packet that the previous observation did not report arrived aboard after that was sent. In
+    # the first observation, or in an overtaken one, the packet is at most SESSION_NS old.
     is_new = is_newest and heard != vehicle.echo
     if is_new:
         vehicle.echoed = vehicle.sent if vehicle.sent < UNSEEN else now - SESSION_NS
         vehicle.echo = heard
     age = max(now - vehicle.echoed, 0) if heard == vehicle.echo else SESSION_NS
-    # F is as old as the observation, which is at most as old as the round trip, measured by clocks
-    # that drift.
+    # F is as old as the observation: at most the round trip, plus the drift of the clocks that
+    # measure the round trip.
     trip = max(forward + backward, 0) + age // DRIFT + 1
     low = max(low, -forward - trip // DRIFT - 1)
     if is_new:
@@ -452,8 +452,8 @@ def _drop_stepped(seen: Seen, row: int) -> None:
         return
     forward = _change(seen.minimum[row, 0], newest, recently)
     backward = _change(seen.minimum[row, 1], newest, recently)
-    # A clock step raises one of the two delays and lowers the other by as much; a change of the
-    # network changes both in the same direction, or only one.
+    # A step of a clock raises the estimated delay of one direction and lowers the other by as much;
+    # a change of the network affects one direction, or both alike.
     large = min(abs(forward), abs(backward)) > STEP_NS
     if large and abs(forward + backward) < max(STEP_NS, 0.2 * abs(forward)):
         for age in range(recently, BUCKETS):

@@ -2,9 +2,10 @@
 
 The plan at step k covers the steps from k + d to k + d + H. `reference.preview` limits how far
 ahead the server may look: with "all" it sees the whole window, otherwise nothing after the step k +
-preview. Later states are extrapolated from the last visible state at its velocity; for a moving
-target with reflection at the bounds of its region (docs/schemes.md lists rejected alternatives). Of
-a point moved in flight (`live`) only the present state is known, the same for all vehicles.
+preview. Later states are extrapolated from the last visible state at its velocity; a moving
+target's are also reflected at the bounds of its region (docs/schemes.md lists rejected
+alternatives). A point that an operator moves in flight (`live`) is known only at present, and is
+the same for all vehicles.
 
 The plan of a vehicle with a dead time θ starts from the state in which its next input takes effect
 (`shared.law.dead_time`), and so follows the trajectory shifted by θ on each axis.
@@ -60,7 +61,7 @@ class Window(NamedTuple):
 class Outlook(NamedTuple):
     reach: I1
     rest_s: F1
-    """Time from the last visible step to the end of the preview plus dead time [s]."""
+    """Part of the dead time that exceeds the preview [s]; shape (axes,)."""
 
 
 class Desired:
@@ -89,15 +90,15 @@ class Desired:
             self._point = module.live_point(scenario)
         self._all = wanted.preview == "all" and self._point is None
         self._reach = H
-        """Number of steps in a page after its first PAGE steps: H, or, with a limited preview, the
-        visible steps."""
+        """Number of steps that a page stores beyond its own PAGE steps: H, or the visible steps if
+        the preview is limited."""
         if not self._all:
             seen_s = 0.0 if self._point or isinstance(wanted.preview, str) else wanted.preview
             # TINY, because 0.15 / 0.05 is 2.9999999999999996.
             self._reach = min(int(seen_s / terms.dt_s + TINY), longest)
         seen_s = self._reach * terms.dt_s
         self._ahead_s = late_s if self._all else np.minimum(late_s, seen_s)
-        """Time from a step to the state stored for it in a page [s]; shape (axes,)."""
+        """Part of the dead time by which the states of a page are shifted [s]; shape (axes,)."""
         left = (seen_s - self._ahead_s) / terms.dt_s + TINY
         self._outlook = Outlook(left.astype(np.int64), late_s - self._ahead_s)
         left_min = H if self._all else int(self._outlook.reach.min())
@@ -111,8 +112,7 @@ class Desired:
         self._dt_s = terms.dt_s
         self._steps = np.arange(PAGE + self._reach + 1)
         self._axes, self._late, shifts = axes, bool(late_s.any()), bool(self._ahead_s.any())
-        # With a dead time a page has two sets of rows: states shifted by the dead time, and
-        # unshifted.
+        # With a dead time a page has two sets of rows: states shifted by it, and unshifted states.
         rows = 2 * axes if shifts else axes
         pages = (1, axes, 1, 2) if self._point else (PAGES, rows, len(self._steps), 2)
         self._pages = np.zeros(pages)
@@ -139,7 +139,7 @@ class Desired:
         return int(self._number[row])
 
     def move(self, position: Array | None, velocity: Array | None, now_ns: int) -> None:
-        """Move a live point, see `LivePoint.move`; without a position it stays where it is."""
+        """Move a live point, see `LivePoint.move`; position None leaves the point where it is."""
         if self._point:
             position = self._point.at(now_ns)[:, 0] if position is None else position
             self._point.move(position, velocity, now_ns)

@@ -1,8 +1,8 @@
 """A point that an operator moves in flight: its position and velocity, computed from the moves.
 
-Its velocity is given with a move, or is a weighted mean over the moves: v ← v + (1 - exp(-h /
-MEMORY_S)) · (Δp / h - v), with h the time between two moves. A point without a given velocity that
-has not been moved for REST_S is at rest.
+The point's velocity is given with a move, or is an exponential average over the moves: v ← v + (1 -
+exp(-h / MEMORY_S)) · (Δp / h - v), with h the time between two moves. A point without a given
+velocity that has not been moved for REST_S is at rest.
 """
 
 import math

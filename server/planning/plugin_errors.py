@@ -29,7 +29,7 @@ class PluginErrors:
         return isinstance(error, Exception)
 
     def note(self, error: Exception, count: str = "") -> None:
-        """Count an error; under `count`, if given, as an expected one, without a traceback."""
+        """Count an error. Errors with their own `count` are reported without a traceback."""
         name, text = count or self._count, ""
         if name not in self._reported:
             self._reported.add(name)

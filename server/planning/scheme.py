@@ -1,6 +1,6 @@
 """Interface of a scheme of delay compensation, and the arrays that schemes fill in.
 
-`shared.scenario.schemes` lists the schemes, `server.schemes.table` loads the one of a scenario.
+`shared.scenario.schemes` lists the schemes, `server.schemes.table` loads a scenario's scheme.
 """
 
 from abc import ABC, abstractmethod
@@ -59,7 +59,7 @@ class Foresight(NamedTuple):
     axes, H)."""
     loss_probability: F2
     """Probability that exactly the newest 1, 2, … of the horizons in flight are lost; shape (block,
-    loss_cases), with 0 cases if no trigger uses them."""
+    loss_cases). `loss_cases` is 0 unless a trigger uses them."""
     start_if_lost: F4
     """State at k+d in each loss case [m, m/s]; shape (block, loss_cases, axes, 2)."""
     inputs_if_lost: F4
@@ -100,7 +100,7 @@ class PlanFigures:
     fresh: bool
     """Whether no usable previous plan exists: first step, or a gap longer than H."""
     solved: bool
-    """Whether the solver has found a plan, which may then be sent."""
+    """Whether the solver has found a plan; without one nothing is sent."""
 
 
 FIGURES = record(PlanFigures)
@@ -180,12 +180,12 @@ class SentPlans(NamedTuple):
 
 
 Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
-"""Function that calls planners of plug-ins, each with its own number. It returns the result or the
-exception of each: TimeoutError if it takes too long, `queue.Full` if too many hang."""
+"""Function that runs planners of plug-ins, given by number and call. Returns each one's result or
+exception: TimeoutError if it takes too long, `queue.Full` if it was not run as too many hang."""
 
 
 Tell = Callable[[str, str], None]
-"""Function called at each error with the name of its count and a text to report, or empty."""
+"""Function called at each error with the name of its count, and a text if it is to be reported."""
 
 
 class Fleet(NamedTuple):
@@ -214,7 +214,7 @@ class Scheme(ABC):
     """
 
     properties: ClassVar[SchemeProperties]
-    """Properties of a plug-in's scheme; built-in ones are in `shared.scenario.schemes`."""
+    """Properties of a plug-in's scheme; for built-in schemes see `shared.scenario.schemes`."""
     solve_ns = -1
     """Time that planning for the last block took [ns], or -1 if it is not measured."""
     uplink_max_ns = UNSEEN
@@ -259,8 +259,8 @@ class Scheme(ABC):
 
     @abstractmethod
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """Fill in the foresight except the plans; the newest observation of each vehicle is recent
-        enough.
+        """Fill in the foresight except the plans; called only for vehicles with an observation that
+        is recent enough.
         """
 
     @abstractmethod
@@ -288,7 +288,7 @@ class Scheme(ABC):
 
     @abstractmethod
     def sent_plans(self, batch: Batch) -> SentPlans:
-        """Plans that are sent, for the record."""
+        """Plans of the batch that are sent, for the flight's record."""
 
     # -- optional parts, for missions and plug-ins -------------------------------------------------
 
@@ -316,7 +316,7 @@ class Scheme(ABC):
         return {}
 
     def follow(self, row: int, lead: RoomMessage | None) -> None:  # noqa: B027
-        """Note a vehicle's leader and its motion in force; None if it has no other server."""
+        """Note who leads a vehicle, and its motion in force; None if this is its only server."""
 
     def leave(self) -> int:
         """Plan nothing further, because the server ends. Return the longest time until all vehicles
@@ -352,5 +352,5 @@ class SchemeCode(NamedTuple):
     """Modules and packages whose kernels only this scheme calls, for the text of
     `control.scheme`."""
     references: Callable[[Scenario, Given, int], Given] = given_references
-    """Function that makes the scheme's desired trajectories from given ones; the number is the
-    largest number of vehicles."""
+    """Function that makes the scheme's desired trajectories from given ones; the last argument is
+    the largest number of vehicles."""

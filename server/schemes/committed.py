@@ -8,7 +8,7 @@ flies the same inputs.
 
 Every observation acknowledges the horizon in force at its step. The prediction replays the inputs
 of this horizon, then those of each horizon in flight, from d steps after the step it was made for.
-A horizon that was not in force d steps after that step is lost, and is not replayed.
+A horizon that does not come into force by then is lost, and is not replayed.
 
     x(i+1) = A x(i) + B (u(i) + w)        from the observation to k + d
 
@@ -17,8 +17,8 @@ w is the disturbance (wind, a wrong gain) as an equivalent input, estimated by
 
 With feedback aboard, a horizon also carries its reference state x̄, which starts at x̂(k), and the
 vehicle flies u(i) + K (x̄(i) - x(i)). The server replays this feedback too. The committed inputs
-are then those that the vehicle flies along x̄ without further disturbance. As K never changes, it
-makes no difference when the next horizon replaces the present one.
+are then those that the vehicle flies along x̄ without further disturbance. K never changes, so the
+time at which the next horizon replaces the present one does not matter.
 
 `schemes.sent` tracks the horizons sent, `schemes.sent_horizons` stores them, `schemes.replay`
 predicts with them, and `schemes.loss_scenarios` predicts the cases in which some are lost.
@@ -107,7 +107,7 @@ class Replay:
             inputs=np.zeros((capacity, ring, axes, most + H), dtype=np.float32),
             reference=np.zeros((capacity, ring, axes), dtype=REFERENCE_STATE),
         )
-        # The time from the oldest usable observation to the end of its plan.
+        # Number of steps from the oldest usable observation to the end of the plan made from it.
         longest = terms.age_max + most + H + 1
         self._schedule = HorizonSchedule(
             np.empty(ring + 2, dtype=np.int64), np.empty(ring + 2, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Delay bound d: largest number of steps from the making of a horizon to its coming into force.
+"""Delay bound d: largest number of steps until a horizon comes into force after it is made.
 
 Every acknowledged horizon gives one sample: the step at which it came into force minus the step
 that it was made for. With each sample of a vehicle
@@ -41,7 +41,7 @@ class DelayBound(NamedTuple):
 
 
 def delay_bound(capacity: int, dt_s: float, most: int, fixed_s: float | None) -> DelayBound:
-    """Delay bounds before any sample, at most `most` [steps]; `fixed_s`: None to estimate them."""
+    """Initial delay bounds, at most `most` steps; `fixed_s`: fixed bound [s], or None."""
     least = 1
     if fixed_s is not None:
         # Rounded up, because d has to cover the whole delay.

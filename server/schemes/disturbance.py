@@ -30,7 +30,7 @@ def observe_disturbance(
     schedule: HorizonSchedule,
     track: FlownTrack,
 ) -> None:
-    """Update the disturbance at a new observation, more slowly after a long `trip` [steps]."""
+    """Update the disturbance at an observation; the longer `trip` [steps], the more slowly."""
     seen, sent = memory.seen[row], memory.sent
     delivery = sent.delivery[row]
     begin, end = seen.base_step, sent.observed[row]
@@ -60,7 +60,7 @@ def observe_disturbance(
         if replayable:
             x = (state.base_p, state.base_v, state.base_u, speed)
             fly_schedule(settings, memory, row, axis, schedule, legs, end, x, track)
-            # Low-pass filter: `lag` is the part of the velocity difference that its output lacks.
+            # Low-pass filter: `lag` is the part of the velocity difference not yet in its output.
             off, left = state.v - track.states[m, 1], settings.follow**m
             memory.state[row, axis].w = updated_disturbance(
                 state.w,

@@ -1,7 +1,7 @@
 """Gain of the feedback around a horizon of inputs.
 
-The feedback uses position and velocity only, u = -K x, because the previous input depends on which
-packets arrived: S of the weights in `shared.scenario.gain` is added to R.
+The feedback uses position and velocity only, u = -K x. It does not use the previous input, which
+depends on the packets that arrived; so the weight S of changes (`shared.scenario.gain`) adds to R.
 """
 
 import numpy as np

@@ -17,7 +17,7 @@ def make(fleet: Fleet) -> Scheme:
     """Make the scheme that a scenario names.
 
     Raises:
-        ConfigError: it cannot be made.
+        ConfigError: the scheme cannot be made.
     """
     text = fleet.scenario.control.scheme
     other = InputScheme if fleet.terms.splines else SplineScheme

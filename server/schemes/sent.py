@@ -44,7 +44,7 @@ class Delivery:
     acknowledged: int
     """Step that the newest plan with a delay sample was made for, or NO_HORIZON."""
     judged: int
-    """Step up to which due plans have been counted as lost or not."""
+    """Step up to which every plan due has been judged: arrived or lost."""
     sent: int
     """Number of plans sent so far."""
     first: int
@@ -105,8 +105,8 @@ def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
     if bound.steps[row] == 0:
         set_first(bound, row, -(-half_trip_ns(clock, row) // sent.dt_ns) + MARGIN)
     raise_to(bound, row, -(-shortest_ns(clock, row) // sent.dt_ns))
-    # Plans made after the plan in force that are due now are lost. They stay in the ring; `judged`
-    # prevents that they are counted twice.
+    # Plans made after the plan in force that are due now are lost. They stay in the ring, and
+    # `judged` prevents counting them twice.
     lost = 0
     for number in range(first_after(sent, row, delivery.in_force), delivery.sent):
         if delivery.judged < sent.plans[row, number % sent.plans.shape[1]].due <= observed:
@@ -159,7 +159,7 @@ def first_after(sent: Sent, row: int, step: int) -> int:
 
 @part
 def first_in_flight(sent: Sent, row: int, in_force: int, observed: int) -> int:
-    """Number of the first plan in flight at an observation: after the one in force, not yet due."""
+    """Number of the first plan in flight at an observation: after the one in force, and not due."""
     ring, least, number = sent.plans.shape[1], oldest(sent, row), sent.delivery[row].sent
     while number > least:
         plan = sent.plans[row, (number - 1) % ring]

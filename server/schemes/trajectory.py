@@ -6,7 +6,7 @@ At step k the server sends the trajectory to follow from k on:
 - the known desired trajectory itself, if the horizon is shorter than the time h below;
 - the target's present state, if the server knows nothing ahead;
 
-- the plan of a plug-in's planner along it, extrapolated where it is unknown
+- the plan of a plug-in's planner along the desired trajectory, extrapolated where unknown
   (`server.mpc.plugin_planners`).
 
 It is sent as a spline with the fewest uniform knots that keep its error within
@@ -87,9 +87,9 @@ COMPARED = 3
 IGNORED = 1e-3
 """Total probability of the cases that the expected gap ignores."""
 RUNS_OUT = 1e-2
-"""Probability of losing all trajectories in flight above which one that ends soon is replaced."""
+"""Probability of losing all trajectories in flight above which an ending one is replaced."""
 TINY = 1e-9
-"""Smallest K_p, which avoids a division by 0 with weights that give K_p = 0 [1/s]."""
+"""Lower limit of K_p in h [1/s]; avoids a division by 0 with weights that give K_p = 0."""
 
 along, guided_to = shared(spline.along), shared(spline.guided_to)
 regulated = shared(spline.regulated)
@@ -231,8 +231,8 @@ class Guidance(SplineScheme):
     def _plan_own(
         self, own: "PluginPlanners", rows: Indices, step: Indices, foresight: Foresight
     ) -> None:
-        """Fill in the trajectories of planners; without a plan the desired trajectory, which is not
-        sent.
+        """Fill in the plans of plug-ins' planners; a vehicle without a plan gets the desired
+        trajectory, which is not sent.
         """
         n, intended, model = len(rows), self._intended, self.terms.model
         desired = self._desired.states(rows, step, foresight.ahead)
@@ -350,7 +350,7 @@ def _intend(
 
 @inline
 def _newest(sent: Sent, row: int, first: int) -> int:
-    """Number of the newest trajectory that may arrive, or of the one in force; negative: none."""
+    """Number of the newest trajectory that may arrive, or else is in force; negative if none."""
     delivery = sent.delivery[row]
     if first < delivery.sent:
         return delivery.sent - 1
