@@ -39,9 +39,9 @@ COOKIE_NS = 60 * SECOND_NS
 HANDSHAKES = 5
 """Largest number of a vehicle's handshake attempts per second, and of answers to repeated ones."""
 PENDING_MAX = 64
-"""Largest number of pending channels of a vehicle, which uses the first RESPONSE that it receives.
-Round trips up to 12 s do not exceed this limit, even if an attacker replays the vehicle's HELLOs,
-five a second."""
+"""Largest number of pending channels of a vehicle; the vehicle uses the first RESPONSE to arrive.
+Even if an attacker replays the vehicle's HELLOs, five per second, round trips up to 12 s stay
+within this limit."""
 COMPLETED_MAX = 16
 """Number of stored completed attempts of a vehicle; repeats of them are not answered."""
 OUT_MAX = 1024
@@ -214,7 +214,7 @@ class SecureGate:
     def number(self, vehicle: int) -> int:
         """Unpredictable number for a new channel of a vehicle."""
         keyed = self._vehicles[vehicle]
-        # Drawn again if the vehicle has a channel of this number, once in 2^32.
+        # Drawn again if a channel of the vehicle already has this number: one case in 2^32.
         while True:
             (number,) = CHANNEL.unpack(self.entropy(CHANNEL.size))
             if keyed.find(number) is None:
@@ -235,9 +235,9 @@ class SecureGate:
     def _initiation(self, datagram: Datagram, now_ns: int) -> GateCall | None:
         """HELLO of an INITIATION with a valid cookie; otherwise answers with a CHALLENGE.
 
-        Repeats of an attempt get new answers while the rate limit grants them, and then the
-        previous answer: so an attacker who replays a vehicle's packets cannot use up the answers
-        that the vehicle needs.
+        A repeated attempt gets a new answer while the rate limit allows, and then the previous
+        answer. So an attacker who replays a vehicle's packets cannot use up the answers that the
+        vehicle needs.
         """
         packet, peer = datagram.payload, datagram.peer
         vehicle, number = handshake.address(packet)
@@ -259,7 +259,7 @@ class SecureGate:
         if public in keyed.completed:  # the vehicle has completed this handshake attempt
             raise ProtocolError(Drop.REPLAYED)
         response = keyed.response(public)
-        # A new attempt needs the key, a repeat only eavesdropping, so each has its own limit.
+        # Anybody who eavesdrops can repeat an attempt, but a new one needs the key: two limits.
         if response is None:
             if not keyed.attempts.grant(now_ns):
                 raise ProtocolError(Drop.TOO_MANY_HANDSHAKES)
@@ -282,6 +282,6 @@ class SecureGate:
 
     def _cookie(self, peer: Address, period: int) -> bytes:
         host, port = peer
-        # Computed for each comparison and never stored, so that unknown senders use no memory.
+        # The cookie is computed for each comparison, not stored: unknown senders use no memory.
         text = f"{host} {port} {period}".encode()
         return hashlib.blake2s(text, key=self._secret, digest_size=COOKIE_BYTES).digest()

@@ -3,8 +3,8 @@
 A vehicle is welcomed when it sends HELLO, and gets its row with its first observation; until then
 the session of an earlier run of its client continues. A row is kept free for each welcomed vehicle
 without a row, but no longer than WELCOME_NS if another vehicle needs it. While observations of one
-run of a client arrive, no other run gets its vehicle number, because it may be another vehicle.
-Free rows are reused, lowest first, so that the rows in use are contiguous.
+run of a client arrive, no other run gets the same vehicle number, because the other run may be on
+another vehicle. Free rows are reused, lowest first, so that the rows in use are contiguous.
 """
 
 from collections import OrderedDict
@@ -30,7 +30,7 @@ InSession = Observation | Close | Time | RoomMessage
 """Messages of a vehicle in a session."""
 
 OTHER_NS = 2 * SECOND_NS
-"""Time for which packets are also sent to an address that repeated a recent packet [ns]."""
+"""Time for which packets are also sent to an address that has repeated a recent packet [ns]."""
 WELCOME_NS = 5 * SECOND_NS
 """Time after the last HELLO for which a row is kept for a vehicle without an observation [ns]."""
 
@@ -67,8 +67,8 @@ class Session:
     sent: int = 0
     """Number of packets sent in the session, modulo NUMBERS."""
     other: Address | None = None
-    """Address from which a recent packet arrived a second time: one of the two senders may forward
-    copies, and the other is then the vehicle."""
+    """Address from which a recent packet arrived a second time: either of the two senders may be an
+    attacker who forwards copies, and the other one the vehicle."""
     other_ns: int = 0
     """Time of the newest repeated packet from `other` [ns]."""
     socket: int = 0
@@ -76,7 +76,7 @@ class Session:
     route: Route | None = None
     """Route to the vehicle over several paths; None if it has only one address."""
     lead: Any = None
-    """The vehicle's messages about its leader (`SessionLead`); None if it has no other server."""
+    """The vehicle's reports of its leader (`SessionLead`); None if this is its only server."""
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -91,13 +91,13 @@ class Session:
         """Datagrams that carry a message to the vehicle: one, or copies for several addresses or
         paths.
 
-        The vehicle's address may have changed since its HELLO, or an attacker may forward copies of
-        its packets that arrive first; then packets must also go to its home address, and to the
-        address of the repeats.
+        The vehicle's address may have changed since its HELLO, or an attacker's copies of its
+        packets may arrive first. So packets also go to the address of the HELLO, and to the address
+        from which packets were repeated.
         """
         if self.route and self.route.is_ready:
             return self.route.sealed(payload, self.line, now_ns)
-        # Sealed once: with keys the vehicle opens the first copy, and drops others as repeats.
+        # Sealed once: with keys, the vehicle then drops all copies but the first as repeats.
         packet = self.line.seal(payload)
         if self.address == self.home and self.other is None:
             return (Datagram(packet, self.home, self.socket),)
@@ -119,8 +119,8 @@ class Sessions:
         silence_ns: time after which a silent vehicle may count as gone [ns].
         hearing: makes a `Hearing` for each session.
         assignment: chooses the vehicles that the server plans for.
-        keeps_rows: whether a row stays reserved for its vehicle after its session. On a mission the
-            other vehicles avoid a silent vehicle.
+        keeps_rows: whether a row stays reserved for its vehicle after its session, as on a mission,
+            where the other vehicles avoid a silent vehicle.
     """
 
     def __init__(
@@ -181,7 +181,7 @@ class Sessions:
         return self._by_row[row]
 
     def holder(self, hello: Hello, now_ns: int) -> Session | None:
-        """Session of another run that uses the vehicle's number, so that this HELLO is refused.
+        """Session of another run with the vehicle's number, for which this HELLO is refused.
 
         This is the live session while its packets arrive; otherwise a welcomed session whose first
         observation may still arrive.
@@ -229,8 +229,8 @@ class Sessions:
             number, hearing = self._number(), self._hearing()
             session = Session(hello.vehicle, number, hello.boot_id, address, address, line, hearing)
         session.home, session.heard_ns, session.socket = address, now_ns, socket
-        # The oldest welcomed vehicle loses its row: by `is_full`, its observation is not expected
-        # any more.
+        # The oldest welcomed vehicle loses its row. It has been silent for so long that `is_full`
+        # expects no observation from it.
         if waiting is self.welcomed_vehicles and len(waiting) == len(self._free_rows):
             self.welcomed_vehicles.popitem(last=False)
         waiting[hello.vehicle] = session

@@ -2,7 +2,7 @@
 number of the leadership in every plan, see docs/together-proof.md.
 
 `AssignmentOfTwo` replaces `server.assignment.Assignment` at the first LEAD (`server.reception`); a
-server in real time loads it before its first packet.
+server in real time loads this module before its first packet.
 """
 
 from collections.abc import Iterable, Iterator
@@ -17,7 +17,7 @@ from skytether.shared.wire.protocol import Message, encode
 TAKEOVER_PLANS = 2
 """Number of plans that a server sends when it takes over, independently of the trigger."""
 LIMITS_NS = 10 * SECOND_NS
-"""Time for which vehicles get the limits of motions every second after a change [ns]."""
+"""Time for which changed limits of motions are sent to vehicles every second [ns]."""
 
 
 class SessionLead(NamedTuple):
@@ -71,7 +71,7 @@ class AssignmentOfTwo(Assignment):
                 yield from session.sealed(encode(self._answer(session)), now_ns)
 
     def _note(self, row: int, lead: Lead | None) -> None:
-        """Note a vehicle's LEAD; None: it has no other server.
+        """Note a vehicle's LEAD; None if the vehicle has only this server.
 
         A server that takes over from another sends two plans: the vehicle may be about to brake,
         and a plan may be lost. Vehicles of a mission hold their position instead.

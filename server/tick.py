@@ -1,6 +1,6 @@
 """The server's tick: the present step of each vehicle, its plan, packets and records.
 
-Ticks lie on a grid of Δt with absolute deadlines; a missed tick is skipped and counted.
+Ticks are due at the multiples of Δt of the server's clock; a missed tick is skipped and counted.
 """
 
 from collections import deque
@@ -124,7 +124,7 @@ class Ticker:
             self._stopwatch.lap("encode")
             if self._records:
                 self._record(decisions)
-        # Comparing bytes is six times as fast as comparing numbers, and they seldom differ.
+        # `idle` seldom changes, and comparing bytes is six times as fast as comparing numbers.
         if controller.idle.tobytes() != self._sessions.idle.tobytes():
             self._report_idle()
         if controller.faults:
@@ -151,7 +151,7 @@ class Ticker:
                 self._events.append(PlanningStopped(vehicle=vehicle, why=str(why)))
 
     def _send_plans(self, decisions: Decisions, now_ns: int) -> None:
-        # The stamp is the time of sending, not the tick's due time: it tells the vehicle the delay.
+        # The time of sending, not of the tick: with this stamp the vehicle measures the delay.
         batch, sessions, sent_us = decisions.batch, self._sessions, stamp_us(now_ns)
         sessions.routes.appraise(decisions)
 
@@ -215,7 +215,7 @@ class Ticker:
         self._stopwatch.lap("record")
 
     def _figures(self, decisions: Decisions) -> dict[str, Array | float]:
-        """Figures of plans for the record; NaN if there is none."""
+        """Figures of the plans for the record; NaN where a plan or a figure is missing."""
         figures, verdict, missing = decisions.figures, decisions.verdict, float("nan")
         names = self._controller.columns
         columns: dict[str, Array | float] = {}

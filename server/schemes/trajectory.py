@@ -5,7 +5,6 @@ At step k the server sends the trajectory to follow from k on:
 - the nominal motion of the vehicle along the known desired trajectory (`server.mpc.nominal`);
 - the known desired trajectory itself, if the horizon is shorter than the time h below;
 - the target's present state, if the server knows nothing ahead;
-
 - the plan of a plug-in's planner along the desired trajectory, extrapolated where unknown
   (`server.mpc.plugin_planners`).
 

@@ -1,4 +1,4 @@
-"""Further policies, in the table TRIGGERS: loaded with a scenario that names one."""
+"""Further policies of the table TRIGGERS, loaded only with a scenario that names one of them."""
 
 from typing import Annotated
 
@@ -33,8 +33,8 @@ def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
 class SendOnDelta(Trigger):
     """Sends if the reference has moved by more than a number of metres since the last packet.
 
-    Level crossings with a hysteresis of one level; no model predicts the reference. Source:
-    Miskowicz, Send-on-delta concept, Sensors 6 (2006).
+    This is sampling at level crossings with a hysteresis of one level, without a prediction.
+    Source: Miskowicz, Send-on-delta concept, Sensors 6 (2006).
     """
 
     def __init__(self, control: ControlConfig, capacity: int, metres: Amount = 0.5) -> None:  # noqa: ARG002
@@ -57,8 +57,8 @@ class SendOnDelta(Trigger):
 
 @trigger(name="self_triggered")
 class SelfTriggered(Trigger):
-    """Sends at a time computed at the last packet: when the reference, at its velocity then, will
-    have moved a number of metres, but after a number of seconds at the latest.
+    """Sends when the reference, at its velocity at the last packet, would have moved by a number of
+    metres since then, and after a number of seconds at the latest.
 
     Source: Velasco, Fuertes, Marti, The self triggered task model for real-time control systems,
     RTSS (2003).
@@ -78,7 +78,7 @@ class SelfTriggered(Trigger):
         rows = situation.rows
         speed_mps = np.linalg.norm(situation.desired[:, :, 0, 1], axis=1)
         self._latest_s[rows] = self._metres / np.maximum(speed_mps, self._metres / self._most_s)
-        # 1e-9: rounding errors of a time in steps.
+        # 1e-9 allows for rounding errors of the time.
         due = situation.since_sent_s > self._wait_s[rows] - 1e-9
         return timed(situation.figures["fresh"] | due, situation.figures)
 
@@ -91,8 +91,8 @@ class Budget(Trigger):
     """Sends while it has a token; joined by & it is a hard limit on the packet rate.
 
     A token bucket: b ← min(b + g, burst) at every step, b ← b - 1 with a packet, and no packet if
-    b < 1. So T seconds have at most burst + packets_per_s · T packets. A packet that another policy
-    sends by a | without a token empties the bucket.
+    b < 1. So T seconds have at most burst + packets_per_s · T packets. If another policy, joined by
+    |, sends a packet although b < 1, b becomes 0.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class Budget(Trigger):
         return timed(filled >= 1.0, situation.figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        # At least 0: a packet that another policy sends without a token does not make it negative.
+        # At least 0, even if another policy has sent a packet without a token.
         self._tokens[rows] = np.maximum(self._filled(rows, figures) - 1.0, 0.0)
         self._step[rows] = figures["step"]
 

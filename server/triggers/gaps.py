@@ -1,4 +1,4 @@
-"""Policies that compare the new plan with the one sent."""
+"""Policies that compare the new plan with the plan sent last."""
 
 import numpy as np
 
@@ -57,5 +57,5 @@ class StateGap(Trigger):
 
 @trigger(needs="cost_gap")
 def cost_gap(situation: Situation, c: Amount = 0.05) -> Verdict:
-    """Sends if flying on with the inputs already sent costs over c more than the new plan."""
+    """Sends if flying on with the inputs already sent costs more than the new plan plus c."""
     return above(situation, Compared.COST_GAP, c)

@@ -1,4 +1,4 @@
-"""A plug-in's policy with its errors caught."""
+"""Wrapper that catches the errors of a plug-in's policy."""
 
 from typing import Any
 
@@ -20,10 +20,10 @@ from skytether.shared.telemetry.record import Compared
 
 
 class Guarded(Trigger):
-    """A plug-in's policy with its errors caught; it fires if it fails.
+    """Wrapper that catches the errors of a plug-in's policy; a policy that fails sends.
 
-    A needless packet costs bytes; a missing one may end the flight. A `budget` joined by & still
-    limits the rate. The policy gets read-only arrays.
+    A needless packet only costs bytes, but a missing packet may end the flight. A `budget` joined
+    by & still limits the rate. The policy gets read-only arrays.
 
     Args:
         name: name of the policy, for messages.

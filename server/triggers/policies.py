@@ -15,13 +15,13 @@ from skytether.shared.telemetry.record import Compared
 
 @trigger
 def heartbeat(situation: Situation) -> Flags:
-    """Sends a plan in place of each heartbeat that is due, so without an additional packet."""
+    """Sends a plan in place of each heartbeat that is due, which adds no packet."""
     return situation.heartbeat_due
 
 
 @trigger(name="expected_gap", needs="expected_gap")
 class ExpectedGap(Trigger):
-    """Sends if the cost of not sending exceeds c, as an expected value over losses in flight."""
+    """Sends if the expected cost of not sending, over losses of packets in flight, exceeds c."""
 
     doubts = True
 

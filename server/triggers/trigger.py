@@ -5,8 +5,8 @@ entries of the table `TRIGGERS` (`shared.scenario.registry`): ours in `policies`
 `schedules` and `further`, and those of plug-ins. docs/triggers.md explains their use, and how to
 write one.
 
-The server evaluates the trigger once per step, after planning. A vehicle without a usable previous
-plan (`fresh`: first step, or a gap longer than H) fires in every policy but `budget` (E18).
+The server evaluates the trigger once per step, after planning. Every policy but `budget` fires for
+a vehicle without a usable previous plan (`fresh`: first step, or a gap longer than H; E18).
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from skytether.server.planning.scheme import Foresight
 
 trigger = TRIGGERS
-"""Decorator of a policy: a function of a `Situation` and its numbers, or a subclass of
+"""Decorator of a policy: a function of a `Situation` and the policy's numbers, or a subclass of
 `Trigger`."""
 Amount = Annotated[float, Meta(ge=0)]
 """Threshold of any unit."""
@@ -77,7 +77,7 @@ class Situation(NamedTuple):
     planned: Array
     """State x_p(k+d) according to the previous plan [m, m/s]; shape (n, axes, 2)."""
     arrays: SituationArrays
-    """Arrays behind the properties below."""
+    """Arrays from which the properties below are taken."""
 
     @property
     def plan(self) -> Array:
@@ -138,12 +138,11 @@ class Verdict(NamedTuple):
     event: Flags
     """Whether the trigger fires; shape (n,)."""
     figure: Array
-    """Figure of the leftmost policy with a comparison, or V(k) of eq. (16) without one; shape
-    (n,)."""
+    """Figure of the leftmost policy that compares figures, or else V(k) of eq. (16); shape (n,)."""
     threshold: Array
-    """Threshold of `figure`, or 0 if nothing is compared; shape (n,)."""
+    """Threshold that `figure` is compared with, or 0 if no policy compares figures; shape (n,)."""
     compared: Compared = Compared.OWN
-    """Figure that is compared with the threshold."""
+    """Name of the figure that is compared with the threshold."""
 
     @property
     def compares(self) -> bool:

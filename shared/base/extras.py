@@ -21,14 +21,14 @@ class ExtraMissing(ModuleNotFoundError):
 
 @contextmanager
 def named(expected: str = "") -> Iterator[None]:
-    """Within this block, an error for a missing module names the smallest extra that provides it.
+    """Within this block, the error for a missing module names the smallest extra with the module.
 
     Args:
         expected: extra to name instead, where several provide a module.
 
     Raises:
         ExtraMissing: instead of a ModuleNotFoundError, if an extra provides the module.
-        ConfigError: instead of it, if a module of Skytether itself was left out.
+        ConfigError: instead of a ModuleNotFoundError, if Skytether is installed without the module.
     """
     try:
         yield

@@ -30,7 +30,7 @@ except ImportError:  # Windows
     fcntl = None  # type: ignore[assignment]
 
 FLAGS = open_flags("O_NOFOLLOW", "O_NONBLOCK")
-"""Flags for opening files to write: opening a link or a pipe fails instead."""
+"""Flags for opening files to write, with which opening a link or a pipe fails."""
 MODE = 0o666
 """Permissions of a new file, which the user's umask restricts."""
 
@@ -79,7 +79,7 @@ def claim_folder(path: Path) -> None:
         OSError: the folder cannot be created, or another command has locked it.
     """
     path.mkdir(parents=True, exist_ok=True)
-    # Windows cannot open folders. Two options may name the same folder.
+    # Not on Windows, which cannot open folders; once for two options that name the same folder.
     if hasattr(os, "O_DIRECTORY") and not use(inode(path)):
         with _claimed(path, os.open(path, os.O_RDONLY | os.O_DIRECTORY)):
             pass
@@ -232,7 +232,7 @@ class Growing:
         buffering: as in `open`; 0: no buffer.
 
     Raises:
-        OSError: it cannot be written, or is not a plain file.
+        OSError: the file cannot be written, or is not a plain file.
     """
 
     def __init__(self, path: Path, buffering: int = -1) -> None:
@@ -251,7 +251,7 @@ class Growing:
             whole: whether the file is complete; it then replaces the older one.
 
         Raises:
-            OSError: it cannot be renamed.
+            OSError: the file cannot be renamed.
         """
         with suppress(OSError):  # the rest of the buffer cannot be written
             self.file.close()

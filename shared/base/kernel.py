@@ -71,8 +71,8 @@ def records(dtype: np.dtype[np.void], ndim: int) -> Any:
 def kernel(function: F) -> F:
     """Function that is compiled on its first call, for the types of its annotations.
 
-    It cannot create arrays, because it is compiled without reference counts: these take an atomic
-    instruction per array and slice, half of the time of a plan.
+    The function cannot create arrays, because it is compiled without reference counts, which would
+    take half of the time of a plan: an atomic instruction per array and slice.
     """
     return _at_first_call(
         numba.njit(error_model="numpy", _nrt=False, pipeline_class=Called)(function)
@@ -96,8 +96,8 @@ def _at_first_call(dispatcher: Any) -> Any:
         compile_kernel(dispatcher)
         answer = dispatcher(*arguments)
         (compiled,) = dispatcher.overloads.values()
-        # A partial function without arguments: its function can be replaced, and calling it costs
-        # less than a method.
+        # A partial without arguments: the function in it can be replaced, and a call costs less
+        # than that of a method.
         code = dispatcher if _CHECKED else compiled.entry_point
         call.__setstate__((code, (), {}, call.__dict__))
         return answer
@@ -280,7 +280,7 @@ def inline(function: F) -> F:
 
 
 def shared(function: F) -> F:
-    """Unchanged Python function that kernels may call, too, with all functions that it calls."""
+    """Python function, returned unchanged, that kernels may now call, like all that it calls."""
     for each in _dependencies(function):
         if inspect.isfunction(each) and each not in _SHARED:
             register_jitable(error_model="numpy", pipeline_class=Linked)(each)
@@ -319,7 +319,7 @@ def plain(function: F) -> F:
 
 
 class DependencyStamp:
-    """Mix-in for a numba cache locator: it depends on all code and constants of a kernel."""
+    """Mix-in for a numba cache locator; its stamp depends on all code and constants of a kernel."""
 
     def get_source_stamp(self) -> str:
         return self.stamp

@@ -8,7 +8,7 @@ import struct
 from ipaddress import IPv4Address, IPv6Address
 
 PROGRAM = ("program", 0)
-"""Peer of an endpoint between a program and the outside; a datagram's payload is a packet."""
+"""Peer that represents the program; the payload of its datagrams is an IP packet."""
 OUTSIDE = ("outside", 0)
 """Peer that represents all other hosts."""
 ADDRESS, GATEWAY = IPv4Address("10.0.2.100"), IPv4Address("10.0.2.2")

@@ -1,4 +1,4 @@
-"""Parser of TOML text, which is refused first if parsing would take too much memory.
+"""Parser of TOML text, which first refuses a text whose parsing would take too much memory.
 
 The standard library's parser stores every prefix of a dotted key: its memory grows with the square
 of the number of parts, and 26 kB of text take 3.5 GB. Nested brackets end in a RecursionError. So

@@ -31,7 +31,7 @@ KEY_SHOWN_MAX = 60
 
 class Answer(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
     refused: str = ""
-    """Why nothing was changed, in one line; empty if the request was carried out."""
+    """Reason why nothing was changed, in one line; empty if the request was carried out."""
     changed: tuple[Changed, ...] = ()
     values: dict[str, Any] = {}
     """Keys that may change and their present values, if the request was empty."""
@@ -140,11 +140,11 @@ class Running:
         return msgspec.json.encode(Answer(refused=reason))
 
     def _whole(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values by complete keys: the value of an argument, such as `network.uplink.loss`, is
-        inserted into the key's text.
+        """Values by the scenario's keys. The value of a text's argument, as `network.uplink.loss`,
+        is inserted into the present text of its key.
 
         Raises:
-            ConfigError: a key may not change, or a text has no such argument.
+            ConfigError: a key may not change, or a key's text has no such argument.
         """
         may, table = sorted(self.changeable), reading.to_table(self._scenario)
         keys = {name: key for key, name in self._names.items()}

@@ -2,7 +2,7 @@
 
 An endpoint opens no socket, reads no clock, draws no unseeded number and prints nothing. Its output
 is datagrams (`outbox`), typed events (`events`) and, on request, numbers (`figures`).
-`shell.driving.driver` drives one on real UDP sockets; `sim.hosts` drives many in virtual time.
+`shell.driving.driver` drives one endpoint on UDP sockets, `sim.hosts` many in virtual time.
 """
 
 import ipaddress
@@ -104,8 +104,8 @@ class Endpoint(ABC):
     keeps = False
     """Whether the endpoint has state for the next run of the process, see `keep`."""
     waits_for_disk = False
-    """Whether the state on disk is outdated: the next run would use it, unless it is replaced or
-    removed first."""
+    """Whether the state on disk is outdated, and must be replaced or removed before the next run
+    reads it."""
     patience_ns = 0
     """Longest time for which datagrams are collected on busy sockets [ns].
 
@@ -136,7 +136,7 @@ class Endpoint(ABC):
         """Start to shut down, on an operator's request.
 
         The driver continues until the endpoint has `finished`, or until the returned time [ns], by
-        default now, and then calls `close`. A second request ends it at once.
+        default now, and then calls `close`. A second request ends the driver at once.
         """
         return now_ns
 
@@ -190,9 +190,7 @@ class Endpoint(ABC):
         return {}
 
     def keep(self, *, now_ns: int) -> bytes | None:  # noqa: ARG002 - ignored by default
-        """State for the next run of this process, if it has changed since the last call; otherwise
-        None.
-        """
+        """State for the next run of this process; None if unchanged since the last call."""
         return None
 
     def kept(self, *, nothing: bool = False) -> None:  # noqa: B027 - optional

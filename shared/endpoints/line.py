@@ -2,7 +2,7 @@
 
     udp:HOST:PORT       listen there, and answer the first sender
     udpout:HOST:PORT    send to this address
-    tcp:HOST:PORT       connect to it
+    tcp:HOST:PORT       connect to this address
     serial:PATH:BAUD    a serial port, as in serial:/dev/ttyACM0:57600
 
 TCP and serial lines are byte streams: an endpoint receives them in pieces, all from the peer
@@ -43,7 +43,7 @@ class Line(NamedTuple):
 
 
 CONNECTIONS_MAX = 128
-"""Largest number of TCP connections at once: their pieces fit the queue of a link."""
+"""Largest number of TCP connections at once, so that their pieces fit into the queue of a link."""
 
 
 class Listen(NamedTuple):

@@ -2,8 +2,8 @@
 
 An endpoint needs a clock that advances at the rate of real time. If the clock is set back or ahead,
 scheduled work would be late or early, and time stamps from before and after could not be compared.
-`Steady` removes every jump, so that the endpoint's time does not advance in the jump, and continues
-after it:
+`Steady` removes every jump, so that the endpoint's time stands still during the jump, and then
+continues:
 
     steady = clock - (all jumps so far)
 
@@ -22,8 +22,8 @@ from skytether.shared.scenario.schema import Scenario
 class Steady(Endpoint):
     """Wraps an endpoint, and passes steady time to it.
 
-    An endpoint that waits for datagrams only may wait for any time: then only a step backwards
-    counts as a jump.
+    An endpoint without a due wake may wait for a datagram for any length of time. So only a step
+    backwards then counts as a jump.
     """
 
     def __init__(self, inner: Endpoint) -> None:
@@ -45,7 +45,7 @@ class Steady(Endpoint):
     def _is_jump(self, seen_ns: int, now_ns: int) -> bool:
         if now_ns < seen_ns:
             return True
-        # Counted from the due wake: an endpoint that waited an hour for it has not jumped.
+        # Counted from the due wake: an hour of waiting for a wake is no jump.
         due_ns = self.next_wake_ns()
         return due_ns is not None and now_ns - max(seen_ns, due_ns) > JUMP_NS
 

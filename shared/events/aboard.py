@@ -53,7 +53,7 @@ class AutopilotRefused(VehicleEvent):
     sentence = "vehicle {vehicle}: its autopilot refuses to {asked}: {answer}"
     asked: str
     answer: str
-    """Name of the autopilot's answer, a MAV_RESULT."""
+    """Name of the MAV_RESULT that the autopilot has answered."""
 
 
 class AutopilotText(VehicleEvent):

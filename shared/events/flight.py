@@ -145,7 +145,7 @@ class Changed(Event, omit_defaults=True):
     before: str
     after: str
     name: str = ""
-    """Operator's name of the key, if it differs from the key, see `endpoints.directions`."""
+    """Name that operators use for the key, if it is another one, see `endpoints.directions`."""
 
     def __str__(self) -> str:
         return f"{self.name or self.key} is {self.after} from now on, it was {self.before}"
@@ -159,7 +159,7 @@ class ChangeRefused(Event):
 
 class PeerEvent(VehicleEvent):
     host: str
-    """Host of the vehicle in an event of the server, of the server in an event of the vehicle."""
+    """Host of the other end: the vehicle's in a server's event, the server's in a vehicle's."""
     port: int
 
     @property

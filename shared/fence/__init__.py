@@ -4,6 +4,6 @@
     margins         the bounds moved inwards, for wind and errors of the model
     contradictions  a fence that has no interior, or that the desired trajectory crosses
 
-The section names `client.fence`, the limiter aboard, which a client imports if there is a fence.
-The package imports `shared.law`, `shared.scenario` and `shared.base`.
+The section names `client.fence`, the limiter aboard. A client imports it only for a fence. The
+package imports `shared.law`, `shared.scenario` and `shared.base`.
 """

@@ -1,15 +1,15 @@
 """Files of other programs: tracks, zones and recorded links.
 
-    skyc, kml, tables, plan, waypoints, ulog, dataflash, gpx  tracks of vehicles, a module a format
+    skyc, kml, tables, plan, waypoints, ulog, dataflash, gpx  tracks of vehicles, one module each
     tracks, timing         tracks for a scenario: one clock, or a speed where a file has no times
     shapes                 `csv`, `mission` and `show`, in the table REFERENCES
     zones                  `geojson`, `kml` and `plan`, in the table ZONES; `zone_files`, `plans`
     recorded, pings        recorded links, for `trace` of netem and for the probe
     bounded, geographic    files read within bounds; coordinates of the globe
 
-Each module of a format of tracks is a `Format`, imported when a file of its format is read: a
-flight without such a file loads none. The package imports `shared.missions`, `shared.scenario`,
-`shared.law` and `shared.base`; ULog needs the extra `ulog`.
+Each module for a format of tracks is a `Format`. It is imported when a file of that format is read.
+The package imports `shared.missions`, `shared.scenario`, `shared.law` and `shared.base`; ULog needs
+the extra `ulog`.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ Tracks = dict[int, tuple[Array, Array]]
 """Rising times from 0 [s; shape (n,)] and points [m; shape (n, axes)], by number of the vehicle."""
 BOM = b"\xef\xbb\xbf"
 HEAD_BYTES = 4096
-"""Size of a file's beginning that shows its format [B]."""
+"""Size of a file's beginning from which its format is recognised [B]."""
 
 
 class Format(Protocol):
@@ -37,7 +37,7 @@ class Format(Protocol):
 
         Args:
             axes: number of axes of the points.
-            origin: origin of the scenario; (): that of the file, if it has one; None: not needed.
+            origin: origin of the scenario; (): use the file's origin, if any; None: none is needed.
             speed_mps: speed between places, for a file without times [m/s].
 
         Raises:
@@ -75,8 +75,8 @@ FORMATS: tuple[tuple[str, tuple[str, ...], Callable[[bytes], bool]], ...] = (
     ("gpx", (), _begins(b"<")),
     ("tables", (".csv",), lambda _: True),
 )
-"""Module of each format, suffixes of its files' names, and a test of a content; the first
-successful test decides."""
+"""Module of each format, suffixes of its files' names, and a test of a file's content. A file has
+the first format whose test succeeds."""
 SUFFIXES = tuple(suffix for _, suffixes, _ in FORMATS for suffix in suffixes)
 """Suffixes of the names of files with tracks."""
 

@@ -26,7 +26,7 @@ PARTS_MAX = 2_000_000
 POINTS_MAX = 1_000_000
 """Largest number of points of all vehicles in a file."""
 SAMPLE_S = 0.05
-"""Longest time between two points made from a curve."""
+"""Longest time between two points made from a curve [s]."""
 ELEMENTS_MAX = 500_000
 """Largest number of elements and attributes in an XML text."""
 CHUNK_BYTES, TAG_BYTES_MAX = 1 << 16, 1 << 20
@@ -84,7 +84,7 @@ def members(content: bytes, is_wanted: Callable[[str], bool], what: str) -> dict
 
 
 def _member(archive: zipfile.ZipFile, file: zipfile.ZipInfo) -> bytes:
-    """Content of a file in a zip; refused if it is longer than the zip states."""
+    """Content of a file in a zip; raises ValueError if it is longer than the zip states."""
     if file.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise ValueError(f"{file.filename[:80]}: expected the compression deflate, or none")
     with archive.open(file) as member:
@@ -156,13 +156,13 @@ def json_of(content: bytes) -> Any:
 
 
 class _Elements(ElementTree.TreeBuilder):
-    """Builder of a bounded XML tree; it refuses document types, and so entities."""
+    """Builder of a bounded XML tree; refuses document types, which could define entities."""
 
     def __init__(self) -> None:
         super().__init__()
         self._count = 0
         self.has_come = False
-        """Whether any part has arrived since this was last set to False."""
+        """Whether an element has begun or text has come since the caller last set this to False."""
 
     def start(self, tag: Any, attrs: Any, /) -> Any:
         self._count, self.has_come = self._count + 1 + len(attrs), True
@@ -182,8 +182,8 @@ def xml_of(content: bytes) -> ElementTree.Element:
     """Root of an XML text.
 
     Raises:
-        ValueError: it is invalid or too large, or has a document type; the message continues a text
-            such as "expected a GPX file".
+        ValueError: the text is invalid or too large, or has a document type; the message continues
+            a sentence such as "expected a GPX file".
     """
     made = _Elements()
     parser, silent = ElementTree.XMLParser(target=made), 0

@@ -5,8 +5,8 @@ a message FMT (type 128). Places are those of POS, or else of GPS with a fix in 
 above the sea. Home is that of ORGN, or else the first place. Between messages, and after an
 incomplete one, bytes are skipped until the next message of a known type.
 
-pymavlink's reader needs a file's name, and prints a line for each skipped byte; this reader takes
-bytes, and bounded time.
+pymavlink's reader needs the name of a file, and prints a line for each skipped byte. This reader
+needs only the content, and its time is bounded.
 """
 
 from struct import Struct
@@ -38,9 +38,9 @@ CODES = {
     "Z": "64s",
     "a": "64s",
 }
-"""Format codes of Python's `struct` by the log's codes of fields."""
+"""Format code of Python's `struct` for each code of a field's type in the log."""
 FACTORS = {"L": 1e-7, "c": 0.01, "C": 0.01, "e": 0.01, "E": 0.01}
-"""Factor from a field's number to its unit, by the field's code."""
+"""Factor that converts a stored number to the field's unit, by the code of the field's type."""
 WANTED = {
     "POS": ("TimeUS", "Lng", "Lat", "Alt"),
     "GPS": ("TimeUS", "Lng", "Lat", "Alt", "Status"),
@@ -50,7 +50,7 @@ WANTED = {
 
 
 class _Fields:
-    """Wanted fields of one type of message."""
+    """Reader of the wanted fields of one type of message."""
 
     def __init__(self, name: str, codes: str, columns: list[str]) -> None:
         self.name = name

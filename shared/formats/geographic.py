@@ -15,7 +15,7 @@ METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
 latter is smaller because degrees are projected onto a plane."""
 Origin = tuple[float, ...]
 """Latitude and longitude of a scenario's origin [degrees], and, if known, its altitude above the
-sea [m]; empty: not known."""
+sea [m]; empty if the origin is unknown."""
 
 
 def check_origin(latitude: Any, longitude: Any, form: str) -> Origin:
@@ -60,7 +60,7 @@ def coordinates(points: Any) -> Array:
 def local(degrees: Array, origin: Origin) -> Array:
     """Metres north and east of the origin, from longitude and latitude [degrees]; shape (n, 2).
 
-    The length of a degree of longitude is that at the mean of both latitudes, as in ArduPilot.
+    A degree of longitude has its length at the mean of both latitudes, as in ArduPilot.
 
     Raises:
         ValueError: a coordinate is out of range, or the origin is not known.
@@ -94,8 +94,8 @@ def above_sea(places: Array, axes: int, origin: Origin | None, home: Origin = ()
     Args:
         places: longitude and latitude [degrees], and altitude [m]; shape (n, 3).
         axes: number of axes to return; with 2 the altitudes are ignored.
-        origin: the scenario's origin; (): not given; None: not needed.
-        home: origin and altitude from the file, used where the scenario has none.
+        origin: the scenario's origin; (): not given; None: none is needed.
+        home: origin and altitude from the file, used if the scenario has none.
 
     Raises:
         ValueError: a coordinate is out of range, or origin or altitude are not known.

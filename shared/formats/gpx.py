@@ -1,7 +1,7 @@
 """GPX: tracks, or else routes, of one or several vehicles.
 
-Each `trk`, with all its segments, is a vehicle; in a file without tracks each `rte` is one. Points
-have times, or are followed at `reference.speed_mps`. Heights (`ele`) are above the sea. Single
+Each `trk`, with all its segments, is a vehicle; in a file without tracks each `rte` is a vehicle. A
+path without times is followed at `reference.speed_mps`. Heights (`ele`) are above the sea. Single
 waypoints (`wpt`) are ignored.
 """
 
@@ -41,7 +41,7 @@ def axes_of(content: bytes) -> int:
 
 @lru_cache(maxsize=1)
 def _paths(content: bytes) -> tuple[Path, ...]:
-    """Paths of a file; raises ValueError if it has none, or a point is invalid."""
+    """Paths of a file; raises ValueError if the file has none, or a point is invalid."""
     try:
         root = bounded.xml_of(content)
     except ValueError as error:

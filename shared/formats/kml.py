@@ -1,8 +1,8 @@
 """KML and KMZ: paths of one or several vehicles.
 
 Each `gx:Track`, or `gx:MultiTrack` with all its tracks, is a vehicle's path with times; in a file
-without them each `LineString` is one, followed at `reference.speed_mps`. Heights count if they are
-above the sea (`absolute`); KML's default is a path on the ground, without heights.
+without tracks each `LineString` is a path, followed at `reference.speed_mps`. Heights are used if
+they are above the sea (`absolute`); KML's default is a path on the ground, without heights.
 """
 
 from array import array
@@ -50,7 +50,7 @@ def axes_of(content: bytes) -> int:
 
 @lru_cache(maxsize=1)
 def _paths(content: bytes) -> tuple[Path, ...]:
-    """Paths of a file; raises ValueError if it has none, or one is invalid."""
+    """Paths of a file; raises ValueError if the file has none, or a path is invalid."""
     try:
         root = kml_root(content)
     except ValueError as error:

@@ -28,7 +28,7 @@ EVERY_S = 1.0
 """Time between two packets in a log without times, summary and command line [s]."""
 WRAP = 65536
 NEAR = 1000
-"""Largest lateness of an answer [packets], and largest loss when icmp_seq wraps [packets]."""
+"""Number of packets that an answer may be late, or that may be lost when icmp_seq wraps."""
 BACK_MAX_S = 10.0
 """Largest step back of a log's times that counts as reordering of answers [s]."""
 
@@ -40,7 +40,7 @@ class LogError(ValueError):
 @dataclass(slots=True)
 class Run:
     first: int | None = None
-    """Number of the first packet; None if the log begins later."""
+    """Number of the first packet; None if the log begins after the first packet."""
     numbered: bool = True
     peer: str = ""
     """Host of the run, in a log of fping."""
@@ -71,9 +71,7 @@ class Run:
         return ahead if ahead > self.last else None
 
     def timed(self) -> tuple[Array, Array]:
-        """Times of sending [s] and round trips [s] of all packets in order,
-        NaN for a lost packet.
-        """
+        """Times of sending [s] and round trips [s] of all packets in order, NaN for a lost packet."""
         low = self.low()
         numbers = np.arange(low, self.last + 1, dtype=np.float64)
         answered = sorted((n, *trip) for n, trip in self.trips.items() if isfinite(trip[1]))
@@ -100,7 +98,7 @@ class Log:
     in_list: bool = False
     """Whether every line describes a packet, as in the output of Windows."""
     every_s: float | None = None
-    """Time between two packets of the newest command line [s]."""
+    """Time between two packets, from the newest command line in the log [s]; None without one."""
 
     def begin(self, first: int | None, *, numbered: bool = True) -> Run:
         self.run = Run(first, numbered, every_s=self.every_s if numbered else None)
@@ -109,9 +107,7 @@ class Log:
         return self.run
 
     def add(self, number: int, trip_s: float, at_s: float, *, copy: bool, peer: str = "") -> None:
-        """Add a packet of a run with numbers; raises LogError if it
-        contradicts the packets before.
-        """
+        """Add a packet of a run with numbers; raises LogError if it contradicts earlier packets."""
         run = self.run
         if run is None or not run.numbered:
             run = self.begin(None)
@@ -270,7 +266,7 @@ def _number(text: str) -> float:
 
 
 def _trip_s(found: re.Match[str]) -> float:
-    """Round trip in a line [s]; NaN if the line has none, half of the bound for `time<1ms`."""
+    """Round trip in a line [s]; NaN if the line has none, and 0.5 ms for `time<1ms`."""
     if not found["ms"]:
         return nan
     return _number(found["ms"]) * 1e-3 * (0.5 if found["sign"] == "<" else 1.0)
@@ -285,7 +281,7 @@ def is_log(text: str) -> bool:
 
 
 def runs(text: str) -> list[Run]:
-    """Runs in a log; raises LogError if it contradicts itself, or is too long."""
+    """Runs in a log; raises LogError if the log contradicts itself, or is too long."""
     log = Log()
     for number, whole in enumerate(StringIO(text), 1):
         if number > LINES_MAX:
@@ -302,8 +298,8 @@ def runs(text: str) -> list[Run]:
 
 
 def joined(found: Sequence[Run]) -> tuple[Array, Array]:
-    """Times of sending [s] and round trips [s], NaN for a lost packet; the runs are appended to
-    each other.
+    """Times of sending [s] and round trips [s] of the packets of all runs, one run after the other;
+    the round trip of a lost packet is NaN.
 
     Raises:
         LogError: there are too many packets, or no answer.

@@ -38,8 +38,8 @@ MODE_FRAMES = {1: 3, 2: 0, 3: 0, 4: 10}
 """MAV_FRAME that QGroundControl gives an item, by its AltitudeMode: above home, above the sea,
 above the terrain (sent as above the sea), and above the autopilot's own terrain data."""
 MULTICOPTERS, ROVERS = (None, 0, 2, 3, 4, 13, 14, 15, 29, 35), (10, 11)
-"""MAV_TYPE of vehicles that can stop anywhere: in the air (None: not given), and on the ground or
-on water."""
+"""MAV_TYPE of vehicles that can stop anywhere: aircraft (None: type not given), and vehicles on the
+ground or on water."""
 SCAN, SCANS = "TransectStyleComplexItem", ("survey", "CorridorScan")
 """Member with the simple items of a complex item, and the types of complex items that have it."""
 VERSIONS = {"plan": (1,), "mission": (2,), "geofence": (2,), SCAN: (1, 2)}
@@ -129,7 +129,7 @@ def _fence(plan: dict[str, Any]) -> dict[str, list[Any]]:
 def route(content: bytes, axes: int, origin: Origin) -> tuple[Array, Array]:
     """Mission of a plan for one vehicle: times [s; shape (n,)] and places [m; shape (n, axes)].
 
-    The vehicle flies straight from place to place, at the plan's speed, and holds at items with a
+    The vehicle flies straight from place to place, at the plan's speed, and waits at items with a
     hold time. It starts above the planned home at the altitude of the plan's take-off, as after an
     autopilot's own take-off, and ends above the place where it would land. A plan that begins with
     another item starts on the ground; a later take-off is straight up.
@@ -156,7 +156,7 @@ def along(
     Args:
         items: simple items, as in a plan.
         start: place of the first take-off, which is vertical [m]; shape (3,).
-        speed_mps: speed until an item changes it; `key`: its name in messages.
+        speed_mps: speed until an item changes it; `key`: name of the speed in messages.
 
     Raises:
         ValueError: an item cannot be flown; the message names it.
@@ -281,7 +281,7 @@ def _place(
 
 
 def _expected(content: bytes, origin: Origin) -> tuple[dict[str, Any], Home]:
-    """Result of `_plan`; the message of its ValueError is a complete sentence."""
+    """Result of `_plan`; raises its ValueError with "expected" before the message."""
     try:
         return _plan(content, origin)
     except ValueError as error:

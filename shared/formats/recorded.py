@@ -5,8 +5,8 @@
 - Logs of ping and similar programs (`pings`).
 - The JSON that `irtt client -o` writes, gzipped or not.
 
-Each is read as rows of a time and a delay or NaN, which `_checked` converts to a path. Half of a
-round trip is used for each direction, and a packet without an answer is lost in both.
+Each file is read as rows of a time and a delay, or NaN; `_checked` converts the rows to a path.
+Half of a round trip is used for each direction, and a packet without an answer is lost in both.
 """
 
 import re
@@ -29,7 +29,7 @@ DELAY_MAX_S = 3600.0
 TEXT_BYTES_MAX = 256 * 1024 * 1024
 """Largest size of a file after decompression [B]."""
 CELLS_MAX = 2_000_000
-"""Largest number of columns, which bounds the memory for a line."""
+"""Largest number of columns; bounds the memory for a line."""
 TIE_S = 1e-6
 """Difference of times up to which two packets count as sent at the same time [s]."""
 
@@ -46,7 +46,7 @@ class RecordedPath:
     time_s: Array
     """Times at which packets were sent, rising from 0 [s]; shape (n,)."""
     delay_s: Array
-    """One-way delays [s]; those of lost packets are interpolated; shape (n,)."""
+    """One-way delays [s], interpolated for lost packets; shape (n,)."""
     lost: Flags
     halved: bool = False
     copies: int = 0
@@ -86,7 +86,7 @@ def text_in(file: File) -> str:
     """Text of a file: UTF-8, or UTF-16 and code pages as Windows writes them, gzipped or not.
 
     Raises:
-        ValueError: it is empty, too long, or no text.
+        ValueError: the content is empty, too long, or no text.
     """
     content = file.content
     if content[:2] == b"\x1f\x8b":
@@ -128,7 +128,7 @@ def table(text: str, columns: Sequence[int], delimiter: str = ",") -> Array:
     """Numbers of columns below a line of names; shape (rows, columns). An empty cell is NaN.
 
     Raises:
-        ValueError: there are too many rows, none, or one with an invalid cell.
+        ValueError: there are too many rows or none, or a cell is invalid.
     """
     rows = text.rstrip().count("\n")
     if rows > ROWS_MAX:
@@ -205,7 +205,7 @@ def _of_csv(text: str) -> RecordedPath:
 
 
 def _unit_of_times(times: Array, name: str) -> float:
-    """Unit of a column of times without a unit [s]; from their size if they count from 1970."""
+    """Unit of the times in a column without a unit [s]; for times since 1970, by their size."""
     largest = float(np.nanmax(times, initial=0.0))
     for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
         if largest >= least:
@@ -217,7 +217,7 @@ def _unit(values: Array, name: str, low: float, high: float) -> float:
     """Unit of a column: seconds if its median is below `low`, milliseconds if above `high`.
 
     Raises:
-        ValueError: the median lies between.
+        ValueError: the median lies between `low` and `high`.
     """
     finite = values[np.isfinite(values)]
     median = float(np.median(finite)) if len(finite) else 0.0
@@ -310,7 +310,7 @@ def _checked(
         begin_s: time on the file's own clock at which `time_s` is 0 [s].
 
     Raises:
-        ValueError: with the first invalid row.
+        ValueError: a row is invalid; the message names the first such row.
     """
     if not 0 < len(time_s) <= ROWS_MAX:
         raise ValueError(f"got {len(time_s)} rows, expected 1 to {ROWS_MAX}")

@@ -1,9 +1,9 @@
 """Shows of Skybrush (`.skyc`): a zip of JSON, with a trajectory for each vehicle.
 
-`show.json` lists the vehicles. A trajectory, in it or in a file that it names by `$ref`, has
+`show.json` lists the vehicles. A trajectory, in `show.json` or in a file named there by `$ref`, has
 `takeoffTime` [s] and points [time after take-off [s], place [m], control points [m]]: from the
 previous point, the vehicle flies along the Bézier curve of the control points, or straight if there
-are none. Until its take-off it waits at its first point.
+are none. Until its take-off the vehicle waits at its first point.
 
 Coordinates are used without conversion. Source: `show/trajectory.py` of Skybrush's server.
 """

@@ -53,7 +53,7 @@ def _from_ned(coordinates: Array, _: Origin | None) -> Array:
 
 def _from_globe(coordinates: Array, origin: Origin | None) -> Array:
     """Metres from the origin. Altitudes are above the sea if the origin's altitude is known;
-    otherwise they are above the origin, and the lowest is 0.
+    otherwise they are above the origin, and the lowest is near 0.
     """
     heights_m, zero_m = coordinates[:, 2:], 0.0
     if origin is None:
@@ -185,7 +185,7 @@ def _names(header: Iterable[str]) -> list[str]:
 
 
 def _check_times(times_s: Array, lines: Indices) -> None:
-    """Raise a ValueError if times in a table do not start at 0 or do not rise."""
+    """Raise a ValueError if the times of a vehicle do not start at 0 or do not rise."""
     if times_s[0] != 0.0:
         raise ValueError(f"line {lines[0]}: expected t = 0 as the first time, got {times_s[0]:g}")
     for i in np.flatnonzero(np.diff(times_s) <= 0.0)[:1]:
@@ -205,7 +205,7 @@ def _read(content: bytes, names: Sequence[str]) -> tuple[Array, Indices]:
         got = ", ".join(map(repr, header))[:80] or "nothing"
         raise ValueError(f"line 1: expected the columns {', '.join(names)}, got {got}")
     at = [header.index(name) for name in names]
-    rows, lines = array("d"), array("q")  # lists would take several times the memory
+    rows, lines = array("d"), array("q")  # lists would need several times the memory
     for line, row in table:
         rows.extend(_numbers([row[i] if i < len(row) else None for i in at], line))
         lines.append(line)

@@ -1,4 +1,4 @@
-"""Times of tracks: one clock for all vehicles of a file, or a speed where the file has no times."""
+"""Times of tracks: on one clock for all vehicles of a file, or from a speed without such times."""
 
 import re
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ from skytether.shared.law.model import Array
 _TIME = re.compile(
     r"(\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:\.\d{1,9})?)?)\d*(?:Z|([+-])(\d\d):?(\d\d))?"
 )
-"""Date and time of ISO 8601, and its offset from UTC."""
+"""Pattern of a date and time in ISO 8601, and of its offset from UTC."""
 
 
 class Line(NamedTuple):
@@ -26,7 +26,7 @@ class Line(NamedTuple):
     points_m: Array
     """Points [m]; shape (n, axes)."""
     times_ns: NDArray[np.int64] | None
-    """Times by the file's clock [ns]; shape (n,); None if the points have no times."""
+    """Times on the file's clock [ns]; shape (n,); None if the points have no times."""
 
 
 def moment_ns(text: str) -> int:
@@ -43,7 +43,7 @@ def together(lines: Iterable[Line], speed_mps: float) -> Tracks:
     """Tracks of the vehicles of a file, numbered from 1 in the order of the file.
 
     All times count from the earliest of the file; a vehicle that begins later waits at its first
-    point. A line without times is followed at a speed. Of points at one time only the first counts.
+    point. A line without times is followed at a speed. Of simultaneous points the first counts.
 
     Raises:
         ValueError: there are too many points, or decreasing times.

@@ -19,7 +19,7 @@ def tracks(content: bytes, axes: int, origin: Origin | None = (), speed_mps: flo
     """Tracks in a file, in one of the formats of `formats.FORMATS`.
 
     Args:
-        origin: the scenario's origin; (): that of the file, if it has one; None: not needed.
+        origin: the scenario's origin; (): use the file's origin, if any; None: none is needed.
         speed_mps: speed between the places of a file without times [m/s].
 
     Raises:

@@ -76,7 +76,7 @@ def kml(file: File, *, is_fence: bool) -> list[Zone]:
 
 
 def kml_root(content: bytes) -> ElementTree.Element:
-    """Root of a KML file, or of the one in a KMZ; raises ValueError if the content is neither."""
+    """Root of a KML file, or of the KML file in a KMZ; raises ValueError for any other content."""
     if bounded.is_zip(content):
         content, *_ = bounded.members(content, _is_kml, "a KML file").values()
     try:
@@ -131,7 +131,7 @@ def _below(element: ElementTree.Element, tag: str) -> Iterator[ElementTree.Eleme
     """Elements with a tag, of any namespace, below an element.
 
     Raises:
-        ValueError: such an element contains another; searching would take quadratic time.
+        ValueError: such an element contains another, which would make searches quadratic in time.
     """
     for found in _tagged(element, tag):
         if next(islice(_tagged(found, tag), 1, None), None) is not None:

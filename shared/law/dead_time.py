@@ -6,8 +6,8 @@ first, for the time r, the input of n + 1 steps ago, then the input of n steps a
     x(k+1) = A x(k) + B u(k-n) + L (u(k-n-1) - u(k-n))          L = B - B(Δt - r)
 
 Planning does not have to consider a dead time (Artstein's reduction). The vehicle knows the inputs
-that it has issued and that act later. With them it predicts the state z in which the next input
-takes effect:
+that it has issued and that do not act yet. From them it predicts the state z in which its next
+input takes effect:
 
     z(k) = x at k Δt + θ             z(k+1) = A z(k) + B u(k), which is eq. (4)
 
@@ -51,14 +51,14 @@ def dead_times(terms: Terms) -> list[DeadTime]:
 
 
 class PendingInputs:
-    """Inputs that one vehicle has issued and that still act or will act; the arguments have one
-    item per axis.
+    """Inputs issued by one vehicle that still act or will act; the arguments have one item per
+    axis.
     """
 
     def __init__(self, model: Sequence[Axis], dead_times: Sequence[DeadTime]) -> None:
         self._axes = list(zip(model, dead_times, strict=True))
-        # n + 2 inputs: from the newest, which does not act yet, back to the one of n + 1 steps ago,
-        # which still acts for r.
+        # n + 2 inputs: from the newest input, which does not act yet, back to the input of n + 1
+        # steps ago, which still acts for r.
         self._issued = [
             deque([0.0] * (axis_dead_time.steps + 2), axis_dead_time.steps + 2)
             for axis_dead_time in dead_times
@@ -70,9 +70,9 @@ class PendingInputs:
         """Issue the input of a step, of each axis [m/s].
 
         Returns:
-            input acting at the end of this step on each axis [m/s]; and its difference from the
-                input acting at the step's start, for the remainder r [m/s], None without a
-                remainder on any axis.
+            input that acts on each axis at the end of this step [m/s]; and the input that acts
+            before it, for the remainder r, minus this input [m/s], or None if no axis has a
+            remainder.
         """
         for issued, u in zip(self._issued, command.tolist(), strict=True):
             issued.append(u)

@@ -3,7 +3,7 @@
 Each end considers the other as gone after its own time-out, and measures the loss from the numbers
 of the packets that arrive. So each packet of a session has a number, and carries the longest
 silence that its sender allows the receiver. Any packet counts as a heartbeat; an end with nothing
-else to send sends one after that silence.
+else to send sends a heartbeat after that silence.
 
 With a packet every T, and n of them within the time-out, a working link is mistaken for lost
 
@@ -28,13 +28,13 @@ TIMEOUT_SHARE = 0.95
 WINDOW = 128
 """Number of newest packets whose arrival is recorded."""
 ASSUMED, WEIGHT = 0.3, 4
-"""Loss ratio that is assumed initially, and the weight of this assumption in packets."""
+"""Loss ratio that is assumed initially, and the weight of this assumption [packets]."""
 NUMBERS = 128
 BEFORE = -(2**64)
 SILENCE_MAX = 2**16 - 1
 """Longest silence that can be requested [half steps]."""
 SESSION_NS = 30 * SECOND_NS
-"""Silence after which the server forgets a vehicle."""
+"""Silence after which the server forgets a vehicle [ns]."""
 RARE_TIMES = 2
 """Longest silence between a vehicle and a server that does not lead it, as a multiple of the
 time-out; bounded by SESSION_NS."""
@@ -53,15 +53,15 @@ def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:
         loss: share of packets lost, independently.
     """
     n = int(TIMEOUT_SHARE * timeout_ns) // silence_ns
-    most = n / (n + 1)  # with more loss, the link is lost less often, but for longer
+    most = n / (n + 1)  # with more loss, the link would be lost less often, but for longer
     loss = min(loss, most)
     return 3600 * SECOND_NS / silence_ns * loss**n * (1.0 - loss)
 
 
 @lru_cache
 def silences(timeout_ns: int, step_ns: int) -> tuple[tuple[float, int], ...]:
-    """Possible heartbeat intervals [ns], longest first, each after the largest loss ratio at which
-    it keeps `false_per_h` within FALSE_PER_H. The last one serves any loss.
+    """Pairs of a loss ratio and a heartbeat interval [ns], longest interval first. Up to its loss
+    ratio an interval keeps `false_per_h` within FALSE_PER_H; the last serves any higher loss.
     """
     fewest, most = -(-timeout_ns // (MOST * step_ns)), timeout_ns // (FEWEST * step_ns)
     counts = range(max(most, 1), max(fewest, 1) - 1, -1) or (1,)
@@ -91,8 +91,8 @@ class Hearing:
     def __init__(self, timeout_ns: int, step_ns: int, fixed_ns: int | None) -> None:
         self._fixed_ns, self._half_step_ns = fixed_ns, step_ns // 2
         self.overtaken_ns = min(timeout_ns, (NUMBERS - 1) * step_ns)
-        """Delay relative to newer packets above which a packet counts as lost [ns]: longer delays
-        exceed the time-out or make the number (modulo NUMBERS) ambiguous."""
+        """Delay behind newer packets above which a packet counts as lost [ns]: a longer delay would
+        exceed the time-out, or make the number (modulo NUMBERS) ambiguous."""
         rare_ns = min(RARE_TIMES * timeout_ns, SESSION_NS // 4)
         self.rare = min(rare_ns // self._half_step_ns, SILENCE_MAX)
         """Longest silence between a vehicle and a server that does not lead it [half steps]."""
@@ -106,7 +106,7 @@ class Hearing:
         self._newest_at = BEFORE
         """Step or time at which the packet with the largest number was sent."""
         self._silence = 0
-        """Cached `silence`; 0: to be computed again."""
+        """Cached value of `silence` [half steps]; 0 if it is outdated."""
 
     def begin(self) -> None:
         self._received, self.newest, self._newest_at, self._silence = 0, -1, BEFORE, 0
@@ -133,7 +133,7 @@ class Hearing:
 
     @property
     def loss(self) -> float:
-        """Share of the other end's packets that are lost; the estimate is rather too high."""
+        """Estimated share of the other end's packets that are lost; ASSUMED before any packet."""
         counted = min(self.newest + 1, WINDOW)
         lost = counted - self._received.bit_count()
         # A prior of WEIGHT packets: a single loss among the first three packets of a session must
@@ -144,8 +144,7 @@ class Hearing:
     def silence_ns(self) -> int:
         """Longest silence to allow the other end [ns].
 
-        If it depends on the loss it is half a step shorter than T, because wakes of steps are not
-        exact.
+        Unless it is fixed, it is T minus half a step, because steps do not begin exactly on time.
         """
         if self._fixed_ns is not None:
             return self._fixed_ns

@@ -1,12 +1,12 @@
 """Leaps: changes of state that no vehicle can make in the given time.
 
-The vehicle compares its measurements with the previous ones, the server compares observations; both
-use these functions, which are also compiled into the server's kernel.
+The vehicle compares its successive measurements with these functions, and the server compares
+observations with the same functions, compiled into its kernel.
 """
 
 ACCELERATION_MPS2 = 50.0
 NOISE_M, NOISE_MPS = 1.0, 2.0
-"""Largest change of position [m] and of velocity [m/s] by noise."""
+"""Largest change of a measured position [m] and velocity [m/s] by noise."""
 
 
 def velocity_leaps(v: float, after_v: float, time: float, noise: float) -> bool:
@@ -21,7 +21,7 @@ def velocity_leaps(v: float, after_v: float, time: float, noise: float) -> bool:
 
 
 def displacement(p: float, v: float, after_p: float, after_v: float, time: float) -> float:
-    """Distance of a position from the one that the mean velocity predicts [m].
+    """Distance of a position from its prediction by the mean velocity [m].
 
     Args:
         p, v: position [m] and velocity [m/s] on one axis before.

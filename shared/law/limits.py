@@ -1,4 +1,4 @@
-"""Limits of a mission's motions, which a vehicle with a standby server compares."""
+"""Limits of a mission's motions; a vehicle checks that its two servers have the same."""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 class Limits(NamedTuple):
     """Limits of the motions that a server plans for a mission. They may change in flight, and must
-    be equal in two servers of a vehicle.
+    be the same in both servers of a vehicle.
     """
 
     speed_mps: float

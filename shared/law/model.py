@@ -9,7 +9,7 @@ system per axis, and the same code serves 2-D and 3-D:
     v(k+1) =        a11 v(k) + b1 u(k)               [0, a11]]        b1]
 
 `advance` is the only implementation of eq. (4). Its arguments are the numbers of one axis or the
-arrays of all, and it is compiled into every kernel that predicts a state.
+arrays of all axes. Every kernel that predicts a state compiles it in.
 """
 
 from collections.abc import Sequence
@@ -51,8 +51,7 @@ class Model(NamedTuple):
     b1: Array
 
     def axes(self) -> list[Axis]:
-        # The sums in the vehicle's loops have at most three terms: numpy takes twice as long as
-        # floats.
+        # Python's floats, because numpy takes twice as long for the few axes of a vehicle.
         columns = [field.tolist() for field in self]
         return [Axis(*numbers) for numbers in zip(*columns, strict=True)]
 
