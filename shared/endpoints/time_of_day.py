@@ -22,6 +22,6 @@ class TimeOfDay(NamedTuple):
     """Time on the endpoint's own clock when the offset was learned [ns]."""
 
     def error_at(self, now_ns: int) -> int | None:
-        """Largest error at a time of the endpoint's own clock [ns]; None if the offset is too old."""
+        """Largest error at a time of the endpoint's clock [ns]; None if the offset is too old."""
         age_ns = now_ns - self.learned_ns
         return self.error_ns + age_ns // DRIFT + 1 if 0 <= age_ns <= FRESH_NS else None

@@ -71,7 +71,7 @@ class Run:
         return ahead if ahead > self.last else None
 
     def timed(self) -> tuple[Array, Array]:
-        """Times of sending [s] and round trips [s] of all packets in order, NaN for a lost packet."""
+        """Sending times [s] and round trips [s] of all packets in order; NaN for a lost packet."""
         low = self.low()
         numbers = np.arange(low, self.last + 1, dtype=np.float64)
         answered = sorted((n, *trip) for n, trip in self.trips.items() if isfinite(trip[1]))
