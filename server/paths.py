@@ -83,7 +83,7 @@ class ServerPaths:
         return next((path for path, places in self._places.items() if place in places), None)
 
     def hear(self, place: Place, now_ns: int) -> int | None:
-        """Note that a datagram has arrived from an address; returns `number`."""
+        """Note that a datagram has arrived from an address; returns the path's `number`."""
         path = self.number(place)
         if path is not None:
             self._places[path][place] = now_ns
@@ -319,7 +319,7 @@ def _paths(session: Session) -> ServerPaths | None:
 def _hear(
     paths: ServerPaths, report: Report, datagram: Datagram, now_ns: int, *, is_recent: bool = True
 ) -> int | None:
-    """Note the report of a message; returns its path, None if its address is not proven."""
+    """Note a message's loss report; returns the message's path, None without a proven address."""
     path = paths.hear(Place(datagram.peer, datagram.socket), now_ns)
     paths.paths.heard(report, datagram.payload, path, now_ns, is_recent=is_recent)
     return path

@@ -36,7 +36,7 @@ class Statement:
     """Numpy record: an observation without its state."""
 
     step: int
-    """Step of the observation, or -1 without one."""
+    """Step of the observation, or -1 if there is none."""
     in_force: int
     """Step that the horizon in force was made for, or NO_HORIZON."""
     since: int
@@ -81,7 +81,7 @@ class Plausibility:
         )
         self._dt_s, self._H = terms.dt_s, terms.horizon
         self._noise_m = NOISE_M + NOISE_MPS * max(terms.dead_time_s)
-        """Largest change of position by noise, after prediction over the dead time [m]."""
+        """Largest change of an observed position by noise, predicted over the dead time [m]."""
         for row in range(capacity):
             self.forget(row)
 

@@ -150,7 +150,7 @@ class Reception:
 
     def _note_repeat(self, datagram: Datagram, now_ns: int) -> bool:
         """Note another address that repeats a vehicle's recent packet; return whether the vehicle
-        has several paths and the copy came over an unproven one.
+        has several paths and the copy came over an unproven path.
         """
         vehicle = self._gate.repeated(datagram)
         session = None if vehicle is None else self._sessions.live(vehicle)
@@ -189,7 +189,7 @@ class Reception:
         datagram: Datagram,
         now_ns: int,
     ) -> None:
-        """Process a message; its content is used only if it is recent."""
+        """Process a message of a session; refuse it if it is too old."""
         sessions = self._sessions
         assigns = sessions.assignment.takes(message)
         session = sessions.welcomed(message) if assigns else sessions.find(message)
@@ -293,7 +293,7 @@ class Reception:
         if verdict == ANEW:
             self._anew(row, None)
             session.hearing.begin()
-        # Not before the plausibility check, which discards a newest observation that was wrong.
+        # After the plausibility check, which may discard the newest observation as wrong.
         self._refuse_overtaken(session, observation.step)
         session.doubted = False
         if report:
@@ -315,8 +315,8 @@ class Reception:
         if not self._controller.observe(row, observation):
             self._sessions.stale[session.row] += 1
             return
-        # Only the packet with the highest counter may change the address: a copy sent from
-        # elsewhere does not, once the original has arrived.
+        # Only the packet with the highest counter may change the address: once the original has
+        # arrived, a copy from elsewhere cannot.
         if call.moves:
             session.move(datagram.peer, call.line, now_ns, datagram.socket)
             if not report:

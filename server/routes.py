@@ -1,4 +1,4 @@
-"""Routes to vehicles that have one address each, which their sessions store.
+"""Routes to vehicles that have one address each, stored in their sessions.
 
 `server.paths` replaces them if a vehicle has several paths.
 """
@@ -14,7 +14,7 @@ from skytether.shared.wire.framing import Report
 from skytether.shared.wire.protocol import Message
 
 ROOM = "skytether.server.paths"
-"""Module for vehicles with several paths; the first loss report before an observation loads it."""
+"""Module for vehicles with several paths, loaded at the first observation with a loss report."""
 
 
 class Route(Protocol):
@@ -47,7 +47,7 @@ class Routes:
         return False
 
     def is_repeat(self, session: Any, datagram: Datagram) -> bool:
-        """Whether a datagram refused as a repeat is the copy from another path."""
+        """Whether a datagram refused as a repeat is a copy that came over another path."""
         return False
 
     def hear(

@@ -3,7 +3,7 @@
 A HELLO is answered in two steps. Without a valid cookie for the sender's address, the server
 answers with a CHALLENGE that contains one, and stores nothing. With the cookie, it answers with a
 RESPONSE that contains the WELCOME and opens a new channel. This channel is pending until the
-vehicle's first packet in it, and only then replaces the live one. So an attacker who replays a
+vehicle's first packet in it, and only then replaces the live channel. So an attacker who replays a
 recorded HELLO cannot end a flight.
 """
 
@@ -63,8 +63,8 @@ FORMS = (
     Form(bytes((VERSION, handshake.INITIATION)), INITIATION_BYTES, INITIATION_BYTES),
     Form(bytes((0x92 + len(Hello._fields),)), 1, PAYLOAD_BYTES_MAX),
 )
-"""Formats of vehicles' datagrams: packets of a channel, and INITIATIONs. A plaintext HELLO (an
-array of msgpack) passes this filter too, so that it can be reported when it is dropped."""
+"""Formats of vehicles' datagrams: packets of a channel, and INITIATIONs. A plaintext HELLO (a
+msgpack array) passes this filter too, so that it can be reported when it is dropped."""
 
 
 class _HandshakeRate:
@@ -78,7 +78,7 @@ class _HandshakeRate:
 
     def grant(self, now_ns: int) -> bool:
         """Whether another handshake is granted."""
-        # Unused handshakes accumulate for at most one second.
+        # Unused handshakes add up for at most one second.
         begun_ns = max(self._granted_ns, now_ns - SECOND_NS)
         if begun_ns + SECOND_NS // HANDSHAKES > now_ns:
             return False

@@ -137,7 +137,7 @@ class Sessions:
         self.entropy = entropy
         self._silence_ns = silence_ns
         self._live: dict[int, Session] = {}
-        """Sessions by vehicle."""
+        """Live sessions, by number of the vehicle."""
         self.welcomed_vehicles: OrderedDict[int, Session] = OrderedDict()
         """Welcomed vehicles without a row, oldest HELLO first; at most one for each free row."""
         self._successors: dict[int, Session] = {}
@@ -156,7 +156,7 @@ class Sessions:
         """Number of observations of each session that arrived after a newer one; shape
         (capacity,)."""
         self.routes = Routes()
-        """Routes to the vehicles; replaced once one of them has several paths."""
+        """Routes to the vehicles; replaced once a vehicle has several paths."""
         self.assignment = assignment
         """Choice of the vehicles that the server plans for."""
         self.idle = np.zeros(capacity, dtype=np.int64)

@@ -21,7 +21,7 @@ LIMITS_NS = 10 * SECOND_NS
 
 
 class SessionLead(NamedTuple):
-    """Reports of the vehicle of a session about its leader."""
+    """A vehicle's reports of its leader in a session."""
 
     lead: Lead
     """The vehicle's LEAD with the largest number of a leadership so far."""
@@ -61,8 +61,8 @@ class AssignmentOfTwo(Assignment):
         return with_leadership(said.lead.number, plan) if said else plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterator[Datagram]:
-        """Send the largest number to vehicles that follow a smaller one, and for a while changed
-        limits to all vehicles.
+        """Send the largest number of the leadership to vehicles that follow a smaller number, and,
+        for a while after a change, the limits to all vehicles.
         """
         is_changed = self.changed_ns is not None and now_ns < self.changed_ns + LIMITS_NS
         for session in sessions:

@@ -79,7 +79,7 @@ class Grid:
 
 
 class Ticker:
-    """Decides for all vehicles in session, sends horizons and heartbeats, and records."""
+    """At each tick, plans for all vehicles in session, sends plans and heartbeats, and records."""
 
     def __init__(
         self,

@@ -194,7 +194,7 @@ class InputPlanner(Planner):
 
 
 def in_turn(calls: Sequence[tuple[int, Callable[[], Any]]]) -> list[Any]:
-    """Call planners one after the other, without a time limit, as in virtual time."""
+    """Results or errors of planners, called one after the other without a time limit."""
     answers = []
     for _, call in calls:
         try:

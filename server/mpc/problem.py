@@ -153,7 +153,7 @@ class SimdBatch(NamedTuple):
     target_p: F2
     """Desired positions at the stages 0 … H [m]; shape (H + 1, L)."""
     target_v: F2
-    """Desired velocities [m/s]; shape (H + 1, L)."""
+    """Desired velocities at the stages 0 … H [m/s]; shape (H + 1, L)."""
     leader_speed: F2
     """Velocities of the plan that is tracked [m/s]; shape (H + 1, L)."""
     drift_p: F2
@@ -161,7 +161,7 @@ class SimdBatch(NamedTuple):
     drift_v: F2
     """Weighted velocity error if all inputs are 0; shape (H, L)."""
     previous: F2
-    """Previous plan, shifted [m/s]; shape (H, L)."""
+    """Previous plan, shifted to the start of the new plan [m/s]; shape (H, L)."""
     gradient: F2
     """Gradient g; shape (H, L)."""
     inputs: F2
@@ -169,7 +169,7 @@ class SimdBatch(NamedTuple):
     side: F2
     """-1 or 1 if the input is at its lower or upper bound, 0 if it is free; shape (H, L)."""
     own: F2
-    """Unconstrained choice of each stage at x = 0 [m/s]; shape (H, L)."""
+    """Unconstrained input of each stage for the state 0 [m/s]; shape (H, L)."""
     k0: F2
     """Column K0 of the backward pass, see `riccati`; shape (H, L)."""
     k1: F2
@@ -223,7 +223,7 @@ def simd_batch(memory: F3) -> SimdBatch:
 
 @lanes
 def set_previous(inputs: Inputs, gap: int, fresh: bool, simd: SimdBatch, lane: int) -> None:
-    """Fill in the previous plan shifted by `gap` steps, its last input repeated; zeros if fresh."""
+    """Fill in the previous plan shifted by `gap` steps, its last input repeated; 0 if `fresh`."""
     H = len(inputs)
     for stage in range(H):
         simd.previous[stage, lane] = 0.0 if fresh else inputs[min(stage + gap, H - 1)]
@@ -378,7 +378,7 @@ def slope(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
 
 @part
 def add_cost(mpc: MPC, axis: int, x: tuple[float, float], change: F1, cost: float) -> float:
-    """Add to `cost` twice the quadratic part of the cost of a change of state and inputs.
+    """Add to `cost` twice the quadratic cost of a change of the state and the inputs.
 
     Args:
         x: change of position [m] and velocity [m/s] at stage 0; if 0, the sum is ΔUᵀ 𝓗 ΔU.

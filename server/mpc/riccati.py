@@ -5,7 +5,7 @@ A condensed QP  ½ Uᵀ𝓗U + gᵀU  with 𝓗 = ΓᵀWΓ + diag(ρ) is the opt
     minimise  Σ ½ xᵢ₊₁ᵀ Wᵢ xᵢ₊₁ + ½ ρᵢ uᵢ² + gᵢ uᵢ,   xᵢ₊₁ = A xᵢ + B uᵢ,   x₀ = 0
 
 So for a fixed set of inputs at their bounds, a backward pass over 2 x 2 matrices solves it in O(H),
-where a factorisation of 𝓗 takes O(H³). The forward pass gives the unconstrained choice v of each
+where a factorisation of 𝓗 takes O(H³). The forward pass gives the unconstrained input v of each
 stage: a stage belongs to the set if v is beyond the bound. A set that reproduces itself is optimal.
 From the shifted previous plan, one or two iterations suffice. If the sets repeat in a cycle (long
 steps, a tiny R, corners of the reference), each further iteration changes only the input with the
@@ -77,7 +77,7 @@ def stage_of(model: Axis, rho: float, after: Three, free: bool) -> tuple[Nine, T
 
 @inline
 def own_input(model: Axis, q0: float, q1: float, g: float, inverse: float) -> float:
-    """Unconstrained choice of a stage at x = 0 [m/s]."""
+    """Unconstrained input of a stage for the state 0 [m/s]."""
     return -(model.b0 * q0 + model.b1 * q1 + g) * inverse
 
 

@@ -41,7 +41,7 @@ RECENT = 3
 """Number of newest intervals that count as recent when looking for a step of a clock. If they hold
 fewer than STEP_SAMPLES samples, since the vehicle reports rarely, up to OLD intervals count."""
 OLD = 8
-"""Age of the minima of F and G with which recent minima are compared [intervals]."""
+"""Smallest age of the minima of F and G that recent minima are compared with [intervals]."""
 STEP_SAMPLES = 5
 """Number of samples needed in both recent and old minima to detect a step of a clock."""
 STEP_NS = 40 * MILLISECOND_NS
@@ -61,11 +61,11 @@ class Contradiction(IntEnum):
 
     NOTHING = 0
     CLOCK = 1
-    """Contradiction to the bounds from delays: a clock was set, or runs at a wrong rate."""
+    """The sample contradicts the bounds from delays: a clock was set, or runs at a wrong rate."""
     ASYMMETRY = 2
-    """Contradiction to the operator's bound `link.asymmetry_s` on the difference of delays."""
+    """The sample contradicts `link.asymmetry_s`, the operator's bound on delay differences."""
     TIME_OF_DAY = 3
-    """Contradiction between a clock offset and the time of day of one end."""
+    """The time of day of one end contradicts the clock offset."""
 
 
 NOTHING, CLOCK, ASYMMETRY, TIME_OF_DAY = map(int, Contradiction)
@@ -77,7 +77,7 @@ class VehicleClock:
     newest: int
     """Interval of the newest sample, counted from zero of the server's clock."""
     heard: int
-    """`Observation.heard` of the newest observation; -1 before the first."""
+    """Count of packets in the newest observation (`Observation.heard`); -1 before the first."""
     echoes: int
     """Number of the server's packets for which the vehicle has reported G."""
     adopted: int
@@ -92,9 +92,9 @@ class VehicleClock:
     """Earliest time at which the newest observation can have been sent, by the server's clock [ns];
     UNSEEN before the first."""
     echo: int
-    """`Observation.heard` of the newest observation that arrived in order; -1 before the first."""
+    """As `heard`, in the newest observation that arrived in order; -1 before the first."""
     echoed: int
-    """Earliest possible arrival aboard of the packet `echo`, by the server's clock [ns]."""
+    """Earliest possible arrival aboard of packet number `echo`, by the server's clock [ns]."""
     steps: int
     """Number of times that a sample contradicted the bounds from delays."""
     other_low: int
@@ -104,9 +104,9 @@ class VehicleClock:
     other: int
     """Server's time at which `other_low` and `other_high` hold [ns]."""
     doubted: int
-    """1 if the time of day was contradicted; then the union of all bounds is used."""
+    """1 if the time of day was contradicted; from then on the union of all bounds is used."""
     uneven: int
-    """1 if the operator's bound on the delays was contradicted; then it is not used."""
+    """1 if the operator's bound on the delays was contradicted, and is no longer used."""
 
 
 FORGOTTEN = ("newest", "heard", "echoes", "adopted", "sent", "echo")
@@ -201,7 +201,7 @@ class ClockMap:
         Args:
             forward_ns: F [ns].
             backward_ns: G [ns].
-            heard: number of the server's packet that G belongs to.
+            heard: number of the server's packets that have arrived aboard, up to that of G.
             now_ns: server's time of reception [ns].
             is_newest: whether the observation is the vehicle's newest; the age of the G in an older
                 observation is unknown.
@@ -225,7 +225,7 @@ class ClockMap:
 
     def steps(self, rows: Indices, now_ns: int) -> Indices:
         """Step k of each vehicle at a time of the server's clock; shape (n,)."""
-        steps = rows.copy()  # a copy that is overwritten: cheaper than a new array
+        steps = rows.copy()  # overwritten below: a copy is cheaper than a new array
         self.tick_ns = now_ns
         _steps(self.seen, rows, now_ns, self._dt_ns, steps)
         return steps
@@ -365,8 +365,8 @@ def _bound(
     """Narrow the bounds of a clock offset by F and G [ns]; returns a `Contradiction`."""
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
-    # A packet that the previous observation did not report arrived aboard after that was sent. In
-    # the first observation, or in an overtaken one, the packet is at most SESSION_NS old.
+    # A newly reported packet arrived aboard after the previous observation was sent. If that is
+    # unknown, or for an overtaken observation, the packet is at most SESSION_NS old.
     is_new = is_newest and heard != vehicle.echo
     if is_new:
         vehicle.echoed = vehicle.sent if vehicle.sent < UNSEEN else now - SESSION_NS
@@ -405,7 +405,7 @@ def _observe(
 ) -> int:
     vehicle, bucket = seen.vehicles[row], now // BUCKET_NS
     contradiction = _bound(seen, row, forward, backward, heard, is_newest, now)
-    # A repeated echo is not a new sample of the delay.
+    # A packet reported again is no new sample of the delay.
     if heard != vehicle.heard:
         vehicle.heard = heard
         seen.echoes[row, vehicle.echoes % ECHOES] = backward
@@ -447,7 +447,7 @@ def _drop_stepped(seen: Seen, row: int) -> None:
             recent, recently = recent + count, age + 1
         elif age >= OLD:
             old += count
-    # With few samples, a single late one would look like a step.
+    # With few samples, a single late sample would look like a step.
     if min(recent, old) < STEP_SAMPLES:
         return
     forward = _change(seen.minimum[row, 0], newest, recently)

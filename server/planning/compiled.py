@@ -51,7 +51,7 @@ def axes_of(model: Model) -> Axes:
 
 
 def laws_of(terms: Terms, gain: Array) -> Laws:
-    """Model, bound and feedback of each axis; K (axes, 2) is rounded to the sent precision."""
+    """Model, bound and feedback of each axis; the gain K (axes, 2) is rounded as it is sent."""
     laws = np.zeros(terms.axes, dtype=AXIS_LAW)
     for name, numbers in terms.model._asdict().items():
         laws[name] = numbers

@@ -84,7 +84,7 @@ class Desired:
         longest = ahead_max(terms) + H
         late_s = np.array(terms.dead_time_s)
         self._point: Any = None
-        """`LivePoint` that all vehicles follow; None with any other shape."""
+        """`LivePoint` that all vehicles follow; None unless the reference's shape is `live`."""
         if wanted.shape == "live":
             module = load("skytether.server.planning.moving_setpoint", "reference.shape live")
             self._point = module.live_point(scenario)
@@ -124,7 +124,7 @@ class Desired:
         self._found = Window(
             self._pages, np.zeros(block, dtype=np.int64), np.zeros(block, dtype=np.int64)
         )
-        """Slots and stages of the visible desired states."""
+        """Visible desired states, given by slots and stages."""
         self._foreseen = Window(
             np.zeros((block, axes, H + 1, 2)),
             np.arange(block),
@@ -212,7 +212,7 @@ def _slot(keys: I1, number: int, page: int) -> int:
 
 @kernel
 def _find(keys: I1, numbers: I1, rows: I1, steps: I1, ahead: I1, found: Window) -> int:
-    """Fill in slots and stages from k + d on; returns the first vehicle without page, or FOUND."""
+    """Fill in slots and stages from k + d on; return the first vehicle without a page, or FOUND."""
     for i in range(len(rows)):
         step = steps[i] + ahead[i]
         number, page = numbers[rows[i]], step // PAGE
@@ -237,11 +237,11 @@ def _extrapolated(p: float, v: float, after_s: float, bound_m: float) -> tuple[f
 def _foresee(
     visible: Window, n: int, ahead: I1, outlook: Outlook, dt_s: float, bound_m: float, window: F4
 ) -> None:
-    """Fill in the windows of vehicles: visible states, and extrapolated ones after them.
+    """Fill in the windows of vehicles: the visible states, then extrapolated states.
 
     Args:
         visible: slots and stages of the desired states from k on, used up to k + reach.
-        ahead: d of each; shape (block,).
+        ahead: d of each vehicle; shape (block,).
         outlook: visible part of the trajectory.
         bound_m: coordinate at which the extrapolation is reflected [m].
         window: output [m, m/s]; shape (block, axes, H + 1, 2).

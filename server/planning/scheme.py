@@ -202,7 +202,7 @@ class Fleet(NamedTuple):
     tell: Tell
     """Function called at each error of a plug-in in flight."""
     planning: Planning | None = None
-    """Function that calls planners of plug-ins; None: they are called one after the other."""
+    """Function that calls planners of plug-ins; None to call them one after the other."""
 
 
 class Scheme(ABC):
@@ -270,7 +270,7 @@ class Scheme(ABC):
     def remember(  # noqa: B027 - many schemes ignore what is sent
         self, rows: Indices, step: Indices, foresight: Foresight, event: Flags
     ) -> None:
-        """Store the plans, before those that the trigger chose are encoded and sent.
+        """Store the new plans; the plans that the trigger chose are encoded and sent afterwards.
 
         Args:
             event: True for vehicles whose plan is sent; shape (n,).
@@ -282,8 +282,8 @@ class Scheme(ABC):
 
         Args:
             batch: vehicles and plans.
-            header: makes the header of the next packet to the vehicle in a row, with a new packet
-                number at each call, so it is called once per packet.
+            header: makes the header of a packet to the vehicle in a row. Each call uses up a packet
+                number, so it is called once per packet.
         """
 
     @abstractmethod
@@ -297,11 +297,11 @@ class Scheme(ABC):
     keeps_rows = False
     """Whether silent vehicles keep their rows."""
     limits: Any = None
-    """Limits (`shared.law.limits`) of motions if all vehicles have to follow one server; its
-    standby needs equal limits. None if each vehicle may follow another server."""
+    """Limits (`shared.law.limits`) of motions if all vehicles have to follow the same server, whose
+    standby needs equal limits; None if each vehicle may follow another server."""
 
     def change(self, scenario: Scenario, keys: frozenset[str]) -> None:  # noqa: B027
-        """Act on changed keys, after a call of `objection` that returned no reason."""
+        """Use changed keys; called only if `objection` has returned no reason."""
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:  # noqa: ARG002
         """Reason why the keys cannot be changed now; empty if they can."""
@@ -312,7 +312,7 @@ class Scheme(ABC):
         return {}
 
     def vehicle_figures(self, row: int) -> dict[str, Any]:  # noqa: ARG002
-        """Figures of a vehicle that the scheme adds to the server's own."""
+        """Figures of a vehicle, in addition to the server's own."""
         return {}
 
     def follow(self, row: int, lead: RoomMessage | None) -> None:  # noqa: B027
@@ -334,7 +334,7 @@ class Scheme(ABC):
 
 
 Given = Callable[[int], Reference] | None
-"""Desired trajectory of each vehicle by its number; None: all vehicles have the scenario's."""
+"""Desired trajectory of each vehicle by its number; None if all have that of the scenario."""
 
 
 def given_references(scenario: Scenario, given: Given, most: int) -> Given:

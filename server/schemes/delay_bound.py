@@ -22,9 +22,9 @@ SAMPLES = 128
 LATE = 0.01
 """Largest share of the samples that may exceed d."""
 RECENT = 16
-"""Number of newest samples of which none may exceed d. On the paper's network, d then changes every
-4 s (Δt = 0.02 s, a horizon at every step) to every 35 s (0.05 s, one step in ten), and 0.3 to 1.3 %
-of the horizons come later than d."""
+"""Number of newest samples, none of which may exceed d. On the paper's network, d then changes
+every 4 s (Δt = 0.02 s, a horizon at every step) to every 35 s (0.05 s, one step in ten), and 0.3 to
+1.3 % of the horizons come later than d."""
 
 
 class DelayBound(NamedTuple):
@@ -77,7 +77,7 @@ def add_sample(bound: DelayBound, row: int, delay: int) -> None:
     # plan assumes.
     d = max(bound.steps[row], min(delay, bound.most))
     count = min(bound.seen[row], SAMPLES)
-    needed, since = 0, count  # number of samples >= d, and number of later samples
+    needed, since = 0, count  # number of samples >= d, and of samples since the last of them
     for slot in range(count):
         if bound.samples[row, slot] >= d:
             age = newest - slot if slot <= newest else newest - slot + SAMPLES

@@ -38,8 +38,8 @@ from skytether.shared.wire.protocol import (
 )
 
 APART_NS = 250_000_000
-"""Longest time between two observations that update the disturbance [ns]. The inputs flown between
-them are interpolated from those at both ends, which is too coarse over longer times."""
+"""Longest time between two observations that update the disturbance [ns]. The inputs flown in
+between are interpolated from the first and the last, which is too coarse over longer times."""
 
 
 class EstimatorSettings(NamedTuple):
@@ -166,7 +166,7 @@ def _observe_disturbance(
             memory.base_velocity[row, i],
             memory.base_flown[row, i],
         )
-        # max, so that it is one step if Δt is longer than APART_NS.
+        # At least one step, even if Δt is longer than APART_NS.
         if begin >= 0 and 0 < m <= max(1, near):
             w, change = memory.disturbance[row, i], (memory.flown[row, i] - u) / m
             p, v = 0.0, velocity

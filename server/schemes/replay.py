@@ -18,7 +18,7 @@ from skytether.shared.law.rule import AxisHorizon
 
 
 class HorizonSchedule(NamedTuple):
-    """Horizon in force at each step, as legs in order of time; arrays are longer than needed."""
+    """Legs: successive steps with the same horizon in force. The arrays are longer than needed."""
 
     begins: I1
     """First step of each leg."""

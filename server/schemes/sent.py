@@ -26,8 +26,8 @@ from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import NO_HORIZON
 
 HOVERS, UNKNOWN = -1, -2
-"""Values that replace a plan's number: no plan is in force, so the vehicle brakes and hovers; or
-the plan is not stored, because it was sent before a restart of the server or dropped aboard."""
+"""Values in place of a plan's number. HOVERS: no plan is in force, the vehicle brakes and hovers.
+UNKNOWN: the plan is not stored; it was sent before a restart of the server or dropped aboard."""
 MARGIN = 2
 """Steps added to half a round trip for the first delay bound, before any acknowledgement."""
 FIRST_LOSS, LOSS_WEIGHT = 0.1, 0.05

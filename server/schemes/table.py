@@ -14,7 +14,7 @@ PLUGINS = f"{__package__}.plugins"
 
 
 def code_of(scenario: Scenario, *, apart: bool = True) -> SchemeCode:
-    """Code of a scenario's scheme; with `apart` that of missions, if the scenario is one."""
+    """Code of a scenario's scheme, or that of missions if `apart` and the scenario is a mission."""
     if apart and scenario.keeps_apart:
         module = load(SCHEME_APART, "missions")
     else:
@@ -39,6 +39,6 @@ def references(scenario: Scenario, given: Given, most: int) -> Given:
 
     Args:
         given: desired trajectories from outside, or None.
-        most: number of vehicles at most.
+        most: largest number of vehicles.
     """
     return code_of(scenario).references(scenario, given, most)

@@ -368,7 +368,7 @@ def _begin(
     intended: F4,
 ) -> int:
     """Fill in the start of the trajectories that would be sent now, in `planned` and `intended`,
-    and their `fresh`; return the number of newly lost trajectories.
+    and `fresh` in `figures`; return the number of newly lost trajectories.
     """
     sent, lost, axes = memory.sent, 0, len(settings.bounds)
     for i in range(len(rows)):

@@ -47,7 +47,7 @@ class StateGap(Trigger):
         if fresh.any():  # without a usable previous plan V is 0
             self._event_step[rows[fresh]], self._event_gap[rows[fresh]] = step[fresh], 0.0
         since = step - self._event_step[rows]
-        # λ is per second, not per step (E5): per step, λ = 1.5 would decay within three steps.
+        # λ is per second, not per step (E5): per step, S would decay within three steps at λ = 1.5.
         threshold = self._event_gap[rows] * np.exp(-self._decay * since) + self._epsilon
         return Verdict(fresh | (gap > threshold), gap, threshold, Compared.STATE_GAP)
 

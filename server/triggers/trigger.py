@@ -47,7 +47,7 @@ class SituationArrays(NamedTuple):
     dt_s: float
     """Length of a step [s]."""
     planned: int
-    """Number of inputs of a plan, H; 1 without a plan."""
+    """Number of planned inputs: H, or 1 with a scheme that sends trajectories."""
     foresight: "Foresight"
     """Predictions and plans of the block."""
     computes: tuple[str, ...]
@@ -159,7 +159,7 @@ _verdict: Callable[[tuple[Flags, Array, Array, Compared]], Verdict] = partial(
 class Trigger:
     """Base class of a policy with memory; one instance serves all vehicles.
 
-    Its constructor is called with the control section of the scenario, the capacity (number of
+    The constructor is called with the control section of the scenario, the capacity (number of
     rows), and then the numbers of the policy.
     """
 

@@ -37,8 +37,8 @@ MODE = 0o666
 # -- files of a command -----------------------------------------------------------------------
 
 _ending: list[ExitStack] = []
-"""For each running command, see `uses`: callbacks that release its locks and remove new files that
-are still empty."""
+"""For each running command, in the order of `uses`: callbacks that release the command's locks, and
+remove new files that are still empty."""
 
 
 @contextmanager
@@ -66,7 +66,7 @@ def claim(path: Path) -> None:
     """
     is_new = not check(path)
     with _claimed(path, os.open(path, os.O_WRONLY | os.O_CREAT | FLAGS, MODE)) as ending:
-        if not os.access(path.absolute().parent, os.W_OK | os.X_OK):  # `replacing` needs it
+        if not os.access(path.absolute().parent, os.W_OK | os.X_OK):  # `replacing` writes there
             raise OSError(EACCES, os.strerror(EACCES), str(path))
         if is_new:
             ending.callback(_remove_empty, path, inode(path))

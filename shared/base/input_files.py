@@ -1,4 +1,4 @@
-"""Reading of files that a user names, with a size limit; they are noted as inputs of the command.
+"""Reads files that a user names, up to a size limit, and notes them as inputs of the command.
 
 `files` writes files, and refuses the files noted here. A flight in virtual time loads only this
 module.

@@ -7,7 +7,7 @@ per line, which is never instantiated but is the record's type for mypy. A part 
 only kernels call, and is compiled into each of them.
 
 Processes that must not wait in flight compile kernels earlier: `machine_code.missing` lists the
-kernels without machine code, `load` prepares all. Importing compiles nothing.
+kernels without machine code, `load` loads or compiles all kernels. Importing compiles nothing.
 
 Machine code is stored on disk, beside the sources or in NUMBA_CACHE_DIR. Numba itself only checks
 whether the kernel's own file has changed; here all functions and constants that a kernel uses, in

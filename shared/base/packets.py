@@ -29,7 +29,7 @@ WITH_PORTS = frozenset((6, 17, 33, 132))
 SHORTEST, SHORTEST6 = 20, 40
 """Sizes of the headers of IPv4 and IPv6 without options [B]."""
 QUOTED, QUOTED6 = 548, 1232
-"""Largest part of a packet quoted in an ICMP error, which has at most 576 or 1280 B [B]."""
+"""Largest part of a packet quoted in an ICMP error, for an error of at most 576 or 1280 B [B]."""
 
 _OUR_MAC, _ITS_MAC = bytes.fromhex("020000000001"), bytes.fromhex("52550a000202")
 _IPV4, _IPV6, _ARP = b"\x08\x00", b"\x86\xdd", b"\x08\x06"

@@ -39,7 +39,7 @@ class Datagram(NamedTuple):
     peer: Address
     """Address of the sender or receiver."""
     socket: int = 0
-    """Number of the endpoint's own socket; 0 is the bound one."""
+    """Number of the endpoint's own socket; 0 is the bound socket."""
 
 
 make_datagram: Callable[[tuple[bytes, Address, int]], Datagram] = partial(tuple.__new__, Datagram)
@@ -113,7 +113,7 @@ class Endpoint(ABC):
     wakes are at least this far apart. 0: each datagram is received at once."""
 
     def __init__(self) -> None:
-        # Shared with the parts of the endpoint, so never replaced.
+        # The parts of the endpoint share these lists, so the lists are never replaced.
         self._out: list[Datagram] = []
         self._events = Events()
         self.pending = self._out, self._events

@@ -305,8 +305,8 @@ class StateDoubted(VehicleEvent):
 
 
 class SteppedLate(VehicleEvent):
-    """A step of a vehicle on a mission began too late, and later than all before; until then the
-    last input was flown.
+    """A step of a vehicle on a mission began too late, and later than every step before; until then
+    the vehicle flew its last input.
     """
 
     sentence = (

@@ -45,7 +45,7 @@ def is_zip(content: bytes) -> bool:
 
 
 def names(content: bytes) -> list[str]:
-    """Names of the files in a zip; none if it cannot be read."""
+    """Names of the files in a zip; none if the zip cannot be read."""
     try:
         return [each.filename for each in _opened(content).infolist()] if is_zip(content) else []
     except (*UNREADABLE, ValueError):

@@ -1,9 +1,9 @@
 """Logs of ping, fping and similar programs, in any language: round trips of packets.
 
 `_TABLE` lists the kinds of lines, and the function that handles each. Words are not interpreted,
-because ping prints them in the user's language: an answer contains a round trip such as `=20.3 ms`,
-every packet a number, and a line with a number but no round trip is a lost packet. Windows prints
-no numbers: there each line between the first line and an empty one is a packet.
+because ping prints them in the user's language: the line of a packet contains a number, and that of
+an answer also a round trip such as `=20.3 ms`; a packet without a round trip is lost. Windows
+prints no numbers: there each line between the first line and an empty line is a packet.
 
 A run is one call of ping. It ends with its summary, which also counts the packets sent after the
 last answer. A new run begins with ping's first line, with a number that is answered twice without
@@ -45,8 +45,8 @@ class Run:
     peer: str = ""
     """Host of the run, in a log of fping."""
     trips: dict[int, tuple[float, float]] = field(default_factory=dict)
-    """Time of the answer, or NaN, and round trip [s] by number; NaN for a packet without an
-    answer."""
+    """Time of the answer [s], NaN if not printed, and round trip [s], NaN without an answer, by
+    number of the packet."""
     last: int = -1
     every_s: float | None = None
     """Time between two packets [s]; None if unknown."""
@@ -256,8 +256,8 @@ _TABLE: tuple[tuple[str, str, Callable[[Log, "re.Match[str]"], None]], ...] = (
     ("", r".", _other),
 )
 LINES = tuple((needle, re.compile(pattern), act) for needle, pattern, act in _TABLE)
-"""Kinds of lines, of which the first match applies: a substring for a quick check, a pattern, and a
-function for such lines. Every pattern takes linear time."""
+"""Kinds of lines: a substring for a quick check, a pattern, and a function for such lines. The
+first kind that matches a line applies. Every pattern takes linear time."""
 _PACKET = re.compile(rf"\b(?:icmp_)?[sr]eq[= ]\d|: \[\d{{1,9}}\], |{_TIME}|^PING6?\b", re.MULTILINE)
 
 

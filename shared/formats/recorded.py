@@ -252,14 +252,14 @@ class _Trip(msgspec.Struct):
 
 
 class _Irtt(msgspec.Struct):
-    """Members of irtt's JSON that are read; the others are ignored."""
+    """Members of irtt's JSON that are read; all others are ignored."""
 
     round_trips: list[_Trip]
 
 
 _LOST = (np.nan, np.nan)
 CLOCKS_S = 1e-3
-"""Largest measurement error of irtt's one-way delays [s]; larger errors are those of the clocks."""
+"""Largest error of irtt's one-way delays with synchronised clocks [s]."""
 
 
 def _of_irtt(text: str, way: Way) -> RecordedPath:

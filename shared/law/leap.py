@@ -35,7 +35,7 @@ def displacement(p: float, v: float, after_p: float, after_v: float, time: float
 def position_leaps(
     p: float, v: float, after_p: float, after_v: float, time: float, noise: float
 ) -> bool:
-    """Whether a change of position is larger than any vehicle can make; arguments as in
+    """Whether a change of position is larger than any vehicle can make; for the arguments see
     `displacement`.
 
     `noise` is the change of position that noise may cause [m].
