@@ -136,7 +136,7 @@ class _KeyedVehicle:
 
 
 class _Answer:
-    """Encoder of the answer to a HELLO, which creates a channel."""
+    """Encoder of the answer to a HELLO; encoding creates a channel."""
 
     def __init__(self, gate: "SecureGate", key: VehicleKey, noise: Responder, now_ns: int) -> None:
         self._gate = gate

@@ -185,7 +185,7 @@ exception: TimeoutError if it takes too long, `queue.Full` if it was not run as 
 
 
 Tell = Callable[[str, str], None]
-"""Function called at each error with the name of its count, and a text if it is to be reported."""
+"""Function called at each error: name of the error's count, and text to report (may be empty)."""
 
 
 class Fleet(NamedTuple):

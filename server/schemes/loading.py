@@ -1,4 +1,4 @@
-"""Code of schemes that a process loads before it compiles kernels, forks or flies."""
+"""Loads the code of schemes before a process compiles kernels, forks or flies."""
 
 from collections.abc import Iterator
 from contextlib import suppress

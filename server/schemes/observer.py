@@ -1,12 +1,12 @@
 """Disturbance observer: estimates wind and model errors as an equivalent input ŵ.
 
 From one observation the model predicts the velocity m steps later, with the inputs flown and ŵ. The
-difference to the observed velocity updates the estimate:
+observed velocity minus this prediction updates the estimate:
 
     ŵ ← ŵ + (1 - e^(-m Δt / T)) (w' - ŵ)          w': constant input that explains the difference
 
-with T = `control.observer_s`. The schemes "predictive" and "committed" use it, each with its own
-record of the flown inputs.
+with T = `control.observer_s`. The schemes "predictive" and "committed" use this observer, each with
+its own record of the flown inputs.
 """
 
 import numpy as np

@@ -44,7 +44,7 @@ class Periodic(Trigger):
     def test(self, situation: Situation) -> Verdict:
         rows, figures = situation.rows, situation.figures
         due = figures["step"] - self._sent_step[rows] >= self._period
-        # A horizon that is due at a step without a previous plan stays due until it is sent.
+        # A plan that is due because there is no previous plan stays due until it is sent.
         fresh = figures["fresh"]
         if fresh.any():
             self._sent_step[rows[fresh]] = figures["step"][fresh] - self._period

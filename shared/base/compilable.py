@@ -1,8 +1,8 @@
 """Functions that are interpreted as plain Python aboard, and compiled in virtual time.
 
-A vehicle takes a step every few milliseconds and needs no compiler; simulations fly thousands of
-vehicles in one process. Both call the same functions: `shared.base.kernel.compile_all` replaces
-those marked here by machine code, with results equal to the last bit.
+A vehicle computes only its own steps and needs no compiler; simulations fly thousands of vehicles
+in one process. Both call the same functions: `shared.base.kernel.compile_all` replaces the
+functions marked here by machine code, with results equal to the last bit.
 """
 
 from collections.abc import Callable

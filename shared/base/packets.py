@@ -1,4 +1,4 @@
-"""Parts of a program's IP packets that netem reads: flow, Ethernet frame, answer if too long.
+"""IP packets of a program for netem: flows, Ethernet frames, answers to packets that are too long.
 
 The addresses are those of slirp4netns, which speaks Ethernet. The program's device has no link
 layer, so only the program's own packets pass it: no ARP, no neighbour discovery (ND).
@@ -88,7 +88,7 @@ def announcements() -> tuple[bytes, bytes]:
 
 
 def too_long(packet: bytes, mtu: int) -> bytes | None:
-    """Router's ICMP answer to a packet longer than the path's MTU; None if none is due."""
+    """Router's ICMP answer to a packet longer than the path's MTU; None if the packet gets none."""
     if packet[0] >> 4 == 6:
         if packet[6] == ICMP6 and packet[SHORTEST6] < ERRORS6:
             return None

@@ -3,9 +3,9 @@
     values by key → may these change? → checked like a scenario → `Endpoint.change` → `Changed`
 
 All values of a request take effect together, between two steps of the endpoint, or none does. A
-request is a JSON object, values by key; an empty object requests the list of keys that may change.
-The answer is an `Answer`. `shell.driving.control` has the socket for both, and `sim.flight` makes
-the same changes in virtual time.
+request is a JSON object of values by key; an empty object requests the list of keys that may
+change. The answer is an `Answer`. `shell.driving.control` has the socket for both, and `sim.flight`
+makes the same changes in virtual time.
 """
 
 from collections.abc import Mapping

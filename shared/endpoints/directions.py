@@ -5,5 +5,5 @@ the opposite, so netem names directions by the ends, see `other_directions`.
 """
 
 Directions = tuple[str, str]
-"""Names of the direction to the vehicle, or to another program, and of the direction from it."""
+"""Names of two directions: to the vehicle or another program, and from the vehicle or program."""
 FLIGHT: Directions = ("uplink", "downlink")

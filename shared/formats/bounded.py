@@ -63,7 +63,7 @@ def members(content: bytes, is_wanted: Callable[[str], bool], what: str) -> dict
 
     Args:
         is_wanted: returns whether to read a file of this name.
-        what: plural that names these files in messages.
+        what: plural noun for these files in messages.
 
     Raises:
         ValueError: the zip cannot be read, has no wanted file, or is too large.

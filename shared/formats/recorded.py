@@ -65,7 +65,7 @@ def recorded_in(file: File, way: Way = "auto") -> RecordedPath:
             needs synchronised clocks; auto: half of the round trip.
 
     Raises:
-        ValueError: the file has no delays, or contradictory ones.
+        ValueError: the file has no delays, or they contradict each other.
     """
     try:
         text = text_in(file)

@@ -28,7 +28,7 @@ from skytether.shared.law.model import Array, Indices
 VEHICLES_MAX = 65_535
 """Largest number of a vehicle."""
 GROUND_M = 1.0
-"""Largest distance from 0 of the lowest altitude in a table of altitudes above the origin [m]."""
+"""Largest magnitude of the lowest altitude in a table of altitudes above the origin [m]."""
 DEGREE = 7
 """Degree of the polynomials of Crazyswarm."""
 

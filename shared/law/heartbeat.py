@@ -1,4 +1,4 @@
-"""Heartbeats: the longest silence of one end, as requested by the other end.
+"""Heartbeats: each end requests the longest time without a packet from the other end.
 
 Each end considers the other as gone after its own time-out, and measures the loss from the numbers
 of the packets that arrive. So each packet of a session has a number, and carries the longest
@@ -85,7 +85,7 @@ class Hearing:
     Args:
         timeout_ns: time without a packet after which the other end counts as gone [ns].
         step_ns: length of a step, the resolution of heartbeats [ns].
-        fixed_ns: silence to allow at any loss [ns]; None: depends on the measured loss.
+        fixed_ns: silence to allow at any loss [ns]; None if it depends on the measured loss.
     """
 
     def __init__(self, timeout_ns: int, step_ns: int, fixed_ns: int | None) -> None:
