@@ -124,7 +124,7 @@ def _against(
         drift = int(abs(new.step - before.step) * dt * SECOND_NS) // DRIFT
         if min(trip, new.forward + new.backward) < -SLACK_NS - drift:
             verdict = CLOCK
-        elif new.step > before.step:  # horizon and jump need the newer step
+        elif new.step > before.step:  # otherwise only the clocks are compared
             back = new.in_force < before.in_force or new.since < before.since
             if new.in_force != NO_HORIZON and back:
                 verdict = HORIZON

@@ -181,7 +181,7 @@ class Sessions:
         return self._by_row[row]
 
     def holder(self, hello: Hello, now_ns: int) -> Session | None:
-        """Session of another run with the vehicle's number, for which this HELLO is refused.
+        """Session of another run with the vehicle's number, because of which this HELLO is refused.
 
         This is the live session while its packets arrive; otherwise a welcomed session whose first
         observation may still arrive.

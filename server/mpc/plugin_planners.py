@@ -29,9 +29,9 @@ from skytether.shared.scenario.registry import PLANNERS
 from skytether.shared.wire.protocol import FLOAT_MAX
 
 ERRORS, LATE, NOT_CALLED = "planner_errors", "planner_late", "planner_not_called"
-"""Counts of steps without a plan: the planner failed, answered too late, or was not called."""
+"""Names of the counts of steps whose planner failed, answered too late, or was not called."""
 EXPECTED = {TimeoutError: LATE, Full: NOT_CALLED}
-"""Count to increase for each exception that stands for a planner's missing answer."""
+"""Name of the count for each exception that comes in place of a planner's answer."""
 
 
 @dataclass(slots=True)

@@ -171,7 +171,7 @@ def _backward(mpc: MPC, axis: int, which: int, simd: SimdBatch) -> None:
 
 @lanes
 def _forward(mpc: MPC, axis: int, simd: SimdBatch, singly: bool) -> None:
-    """Forward pass: update the active set; if `singly`, only find the input to change most."""
+    """Forward pass: update the active set; if `singly`, only find the input that must change."""
     model, bound, L = axis_at(mpc.model, axis), mpc.bounds[axis], len(simd.p)
     b0, b1, x0, x1 = model.b0, model.b1, simd.leader_p, simd.leader_v
     u, side, own, changed, active = simd.inputs, simd.side, simd.own, simd.changed, simd.active

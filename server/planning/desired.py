@@ -4,8 +4,8 @@ The plan at step k covers the steps from k + d to k + d + H. `reference.preview`
 ahead the server may look: with "all" it sees the whole window, otherwise nothing after the step k +
 preview. Later states are extrapolated from the last visible state at its velocity; a moving
 target's are also reflected at the bounds of its region (docs/schemes.md lists rejected
-alternatives). A point that an operator moves in flight (`live`) is known only at present, and is
-the same for all vehicles.
+alternatives). For a point that an operator moves in flight (`live`), only the present state is
+known; this state is the same for all vehicles.
 
 The plan of a vehicle with a dead time θ starts from the state in which its next input takes effect
 (`shared.law.dead_time`), and so follows the trajectory shifted by θ on each axis.

@@ -181,7 +181,7 @@ class SentPlans(NamedTuple):
 
 Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
 """Function that runs planners of plug-ins, given by number and call. Returns each one's result or
-exception: TimeoutError if it takes too long, `queue.Full` if it was not run as too many hang."""
+exception: TimeoutError if it takes too long, `queue.Full` if too many hang for it to be run."""
 
 
 Tell = Callable[[str, str], None]

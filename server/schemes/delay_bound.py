@@ -1,4 +1,4 @@
-"""Delay bound d: largest number of steps until a horizon comes into force after it is made.
+"""Delay bound d: largest number of steps from making a horizon until it comes into force.
 
 Every acknowledged horizon gives one sample: the step at which it came into force minus the step
 that it was made for. With each sample of a vehicle

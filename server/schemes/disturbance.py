@@ -30,7 +30,7 @@ def observe_disturbance(
     schedule: HorizonSchedule,
     track: FlownTrack,
 ) -> None:
-    """Update the disturbance at an observation; the longer `trip` [steps], the more slowly."""
+    """Update the disturbance at an observation; a long `trip` [steps] slows the update."""
     seen, sent = memory.seen[row], memory.sent
     delivery = sent.delivery[row]
     begin, end = seen.base_step, sent.observed[row]

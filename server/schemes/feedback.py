@@ -1,7 +1,7 @@
 """Gain of the feedback around a horizon of inputs.
 
 The feedback uses position and velocity only, u = -K x. It does not use the previous input, which
-depends on the packets that arrived; so the weight S of changes (`shared.scenario.gain`) adds to R.
+depends on the packets that arrived; so the weight S (`shared.scenario.gain`) is added to R.
 """
 
 import numpy as np

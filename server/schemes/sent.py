@@ -159,7 +159,7 @@ def first_after(sent: Sent, row: int, step: int) -> int:
 
 @part
 def first_in_flight(sent: Sent, row: int, in_force: int, observed: int) -> int:
-    """Number of the first plan in flight at an observation: after the one in force, and not due."""
+    """Number of the first plan after the plan in force that is not yet due at an observation."""
     ring, least, number = sent.plans.shape[1], oldest(sent, row), sent.delivery[row].sent
     while number > least:
         plan = sent.plans[row, (number - 1) % ring]

@@ -86,7 +86,7 @@ COMPARED = 3
 IGNORED = 1e-3
 """Total probability of the cases that the expected gap ignores."""
 RUNS_OUT = 1e-2
-"""Probability of losing all trajectories in flight above which an ending one is replaced."""
+"""Probability of losing all trajectories in flight, above which an ending plan is replaced."""
 TINY = 1e-9
 """Lower limit of K_p in h [1/s]; avoids a division by 0 with weights that give K_p = 0."""
 

@@ -57,5 +57,6 @@ class StateGap(Trigger):
 
 @trigger(needs="cost_gap")
 def cost_gap(situation: Situation, c: Amount = 0.05) -> Verdict:
-    """Sends if flying on with the inputs already sent costs more than the new plan plus c."""
+    """Sends if the cost gap exceeds c: cost of flying on with the old plan minus that of the
+    new."""
     return above(situation, Compared.COST_GAP, c)

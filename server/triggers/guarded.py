@@ -20,7 +20,7 @@ from skytether.shared.telemetry.record import Compared
 
 
 class Guarded(Trigger):
-    """Wrapper that catches the errors of a plug-in's policy; a policy that fails sends.
+    """Wrapper that catches the errors of a plug-in's policy; if the policy fails, a plan is sent.
 
     A needless packet only costs bytes, but a missing packet may end the flight. A `budget` joined
     by & still limits the rate. The policy gets read-only arrays.
