@@ -50,7 +50,7 @@ def _outside(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _over_fence(scenario: Scenario, home: Array, states: Array) -> Iterator[Contradiction]:
-    """Contradictions of the fence with a trajectory from home that leaves it or is too fast."""
+    """First contradiction of the fence with a trajectory that leaves it or is too fast."""
     fence = scenario.section(FenceConfig)
     position, speed = states[..., 0], np.linalg.norm(states[..., 1], axis=1)
     low, high, radius = inner_bounds(scenario)
