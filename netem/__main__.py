@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 NETWORK = "transparent"
 """Default scenario: without impairments, for packets of any program."""
 COLLECT_AFTER = 100_000
-"""Number of new objects after which garbage is collected. Queued packets are not garbage, and the
-default of 700 would scan all of them many times a second."""
+"""Number of new objects after which Python collects garbage. With the default of 700 it would scan
+all queued packets, which are not garbage, many times a second."""
 MTU_MIN, MTU_MAX = 1280, 65_520
 """Bounds of an MTU: the smallest that IPv6 allows, the largest that slirp4netns accepts [B]."""
 
@@ -53,8 +53,8 @@ class NetemOptions(ProcessOptions):
 
     scenario: command.ScenarioName = NETWORK
     """A scenario's name (`skytether list scenarios`) or a .toml file, for its network and seed.
-    netem then belongs to a flight: a packet's fate depends on its time, not on its number in its
-    flow."""
+    Given one, netem belongs to a flight: a packet's fate depends on the time, not on the packet's
+    number in its flow."""
     bind: str = "127.0.0.1:47000"
     """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host is written in
     brackets, as in [::1]:47000; its socket receives IPv6 only, even for [::]. A name means its IPv4
@@ -67,10 +67,10 @@ class NetemOptions(ProcessOptions):
     to_server: str | None = None
     """Impairments of packets from clients to the server; the key network.downlink."""
     path: Annotated[int, Argument(metavar="N")] = 1
-    """Path of the scenario to emulate, from 1, see network.paths; the number after the last is the
-    path to a standby server, impaired like the first."""
+    """Number of the scenario's path to emulate, from 1, see network.paths. The number after the
+    last path is the path to a standby server, impaired like path 1."""
     tcp: bool = False
-    """Relay TCP connections in place of UDP: latency, a rate and cuts, and no packet loss."""
+    """Relay TCP connections instead of UDP: with latency, a rate and cuts, but no packet loss."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
     """Largest number of clients at once; each needs a socket. By default 512, or as many as the
     system allows. With --tcp: number of connections, 1 to 128, by default 128."""
@@ -93,23 +93,23 @@ class RunOptions(ProcessOptions):
     mtu: Annotated[int, Argument(metavar="BYTES")] = 1500
     """Largest packet of the program's network device, 1280 to 65520 bytes."""
     path_mtu: Annotated[int | None, Argument(metavar="BYTES")] = None
-    """Largest packet that passes, if smaller: for a longer one the program gets an ICMP error."""
+    """Largest packet that passes, if below --mtu; longer packets cause an ICMP error."""
 
 
 def emulate(argv: Sequence[str]) -> None:
     """Delay, reorder and lose datagrams between clients and a server, until SIGINT or SIGTERM.
 
-    It carries any UDP. Clients send to --bind instead of the server:
+    netem carries any UDP. Clients send to --bind instead of the server:
 
         skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000
             --to-client "constant(50ms)"
             --to-server "gamma(20ms, 80ms, 30ms) & loss(5%) & rate(1mbit)"
 
-    Without these, packets pass at once. With one seed, the packet with the same number in its flow
-    has the same fate in each run. SIGUSR1 prints the counters so far; they are also printed
-    at the end. With --control, `skytether set` changes the impairments while it runs.
+    Without impairments, packets pass at once. With the same seed, the nth packet of a flow has the
+    same fate in each run. SIGUSR1 prints the counters so far; they are also printed at the end.
+    With --control, `skytether set` changes the impairments while netem runs.
 
-    `skytether netem run … -- CMD ARG…`: the same, for all packets of one program.
+    `skytether netem run … -- CMD ARG…` does the same for all packets of one program.
     """
     if argv[:1] == ["run"]:
         emulate_for(argv[1:])
@@ -144,19 +144,19 @@ def emulate(argv: Sequence[str]) -> None:
 
 
 def emulate_for(argv: Sequence[str]) -> None:
-    """Run a program whose only network is netem; exit code and standard streams are its own.
+    """Run a program whose only network is netem, with the program's exit code and streams.
 
         skytether netem run --to-program "constant(50ms)"
             --from-program "constant(50ms) & loss(5%)" --seed 7
             -- curl http://10.0.2.2:8000/
 
-    All its packets of IPv4 and IPv6 are impaired, as are those of its children: TCP, UDP, QUIC,
-    ICMP, DNS. It reaches other machines as before, and this machine at 10.0.2.2 and fd00::2. With
-    one seed, the packet with the same number in its flow has the same fate in each run. It needs
+    All IPv4 and IPv6 packets of the program and its children are impaired: TCP, UDP, QUIC, ICMP,
+    DNS. The program reaches other machines as before, and this machine at 10.0.2.2 and fd00::2.
+    With the same seed, the nth packet of a flow has the same fate in each run. The command needs
     Linux and slirp4netns, and root or user namespaces.
 
     SIGUSR1 prints the counters so far to stderr; with --control, `skytether set` changes the
-    impairments while it runs. All other signals are passed to the program.
+    impairments in flight. All other signals are passed to the program.
     """
     from skytether.netem.tunnel import Tunnel
     from skytether.shell.driving.program import ProgramError, program

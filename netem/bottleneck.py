@@ -1,9 +1,9 @@
-"""Bottleneck: packets of all flows pass a finite rate one after another, and queue for it.
+"""Bottleneck: a finite rate, which packets of all flows pass one after another after queueing.
 
 An idle bottleneck serves a packet at once; otherwise the packet waits in a queue of limited bytes.
 Sizes include the headers of IP and UDP.
 
-`netem.link` loads it for a direction with a `rate` or with `deliveries`.
+`netem.link` loads this module for a direction with a `rate` or with `deliveries`.
 """
 
 from bisect import bisect_left
@@ -21,7 +21,7 @@ QUANTUM_BYTES = 300
 """Bytes that each flow may send per turn under fair queueing [B]: a few small packets; a larger
 packet needs several turns."""
 TARGET_NS, INTERVAL_NS = 5 * MILLISECOND_NS, 100 * MILLISECOND_NS
-"""CoDel's parameters: acceptable time in the queue, and time to react to more (RFC 8289) [ns]."""
+"""CoDel's TARGET and INTERVAL: acceptable queueing time, and reaction time (RFC 8289) [ns]."""
 
 T = TypeVar("T")
 
@@ -40,15 +40,15 @@ class Codel:
     """Controlled delay (RFC 8289): drops packets more and more often until queueing times fall."""
 
     above_ns: int = 0
-    """Time from which packets are dropped if waits stay too long [ns]; 0 while they are short."""
+    """Time at which drops begin if queueing times stay too long [ns]; 0 while they are short."""
     drop_ns: int = 0
-    """Time of the next drop."""
+    """Time of the next drop [ns]."""
     count: int = 0
     last_count: int = 0
     dropping: bool = False
 
     def drops(self, now_ns: int, *, is_fine: bool) -> bool:
-        """Whether to drop the packet at the front; `is_fine`: short wait, or queue nearly empty."""
+        """Whether to drop the first packet; `is_fine`: it waited shortly, or few packets wait."""
         late = False
         if is_fine:
             self.above_ns = 0
@@ -66,7 +66,7 @@ class Codel:
             self.drop_ns += round(INTERVAL_NS / sqrt(self.count))
             return True
         self.dropping = True
-        # Shortly after the last drops the drop rate continues about where it was (RFC 8289).
+        # If the last drops were recent, the drop rate resumes near its last value (RFC 8289).
         recent = now_ns - self.drop_ns < 16 * INTERVAL_NS
         self.count = max(1, self.count - self.last_count) if recent else 1
         self.last_count = self.count
@@ -81,7 +81,7 @@ class FlowQueue(Generic[T]):
     packets: "deque[Waiting[T]]" = field(default_factory=deque)
     bytes: int = 0
     credit: int = 0
-    """Bytes that the queue may still send in its turn."""
+    """Number of bytes that the queue may still send in its turn [B]."""
     codel: Codel = field(default_factory=Codel)
 
 
@@ -118,7 +118,7 @@ class Bottleneck(Generic[T]):
         queue.packets.append(packet)
         self._count(key, packet, 1)
         while self.waiting_bytes > self._queue.room_bytes and not self._queue.keeps_all:
-            # The flow with the longest queue loses its newest packet; other flows lose none.
+            # Only the flow with the longest queue loses packets, its newest first.
             longest = max(self._lines, key=lambda flow_key: self._lines[flow_key].bytes)
             last = self._lines[longest].packets.pop()
             self._count(longest, last, -1)
@@ -155,8 +155,7 @@ class Bottleneck(Generic[T]):
     def _next(self, now_ns: int) -> Waiting[T] | None:
         while self.waiting:
             key, queue = next(iter(self._lines.items()))
-            # Deficit round robin: a queue that has used up its credit goes to the end with a new
-            # quantum.
+            # Deficit round robin: a queue without credit gets a new quantum and goes to the end.
             if self._is_fair and queue.credit <= 0:
                 queue.credit += QUANTUM_BYTES
                 self._lines.move_to_end(key)
@@ -171,7 +170,7 @@ class Bottleneck(Generic[T]):
 
     def _is_late(self, queue: FlowQueue[T], packet: Waiting[T], now_ns: int) -> bool:
         waited_ns = now_ns - packet.entered_ns
-        # At a low rate a single packet takes longer than 5 ms, and must not be dropped for that.
+        # At a low rate the service of one packet takes over 5 ms, which is no reason to drop it.
         target_ns = max(TARGET_NS, round(self._largest / self._queue.bytes_per_s * SECOND_NS))
         # With at most one more packet waiting, a drop would leave the bottleneck idle.
         is_fine = waited_ns < target_ns or queue.bytes <= self._largest
@@ -198,7 +197,7 @@ class _Rate:
 
 
 class _Deliveries:
-    """Rate of a mahimahi file, repeated, starting with the first packet.
+    """Rate given by a mahimahi file, which starts with the first packet and is repeated.
 
     Packets share the bytes of a delivery opportunity; unused bytes are lost.
     """
@@ -207,7 +206,7 @@ class _Deliveries:
         self._times_ns: list[int] = [round(time_s * SECOND_NS) for time_s in times_s]
         self._began_ns: int | None = None
         self._used_bytes = 0
-        """Number of bytes of past deliveries that were used or lost [B]."""
+        """Number of bytes in past delivery opportunities, used or lost [B]."""
 
     def done_ns(self, now_ns: int, size: int) -> int:
         if self._began_ns is None:
@@ -215,7 +214,7 @@ class _Deliveries:
         times_ns = self._times_ns
         rounds, at_ns = divmod(now_ns - self._began_ns, times_ns[-1])
         before = rounds * len(times_ns) + bisect_left(times_ns, at_ns)
-        # Deliveries that passed while nothing waited are lost, as in mahimahi.
+        # Delivery opportunities that passed while nothing waited are lost, as in mahimahi.
         self._used_bytes = max(self._used_bytes, before * DELIVERY_BYTES) + size
         rounds, last = divmod(ceil(self._used_bytes / DELIVERY_BYTES) - 1, len(times_ns))
         return max(now_ns, self._began_ns + rounds * times_ns[-1] + times_ns[last])

@@ -1,8 +1,8 @@
 """Both directions of an emulated network, independent of what it carries: see `proxy` for
 datagrams, `relay` for byte streams and `tunnel` for packets of IP.
 
-As in the paper, uplink is to the vehicle; without a vehicle, to a proxy's client or a tunnel's
-program. With other programs the directions have other names (`shared.endpoints.directions`).
+As in the paper, the uplink leads to the vehicle; without a vehicle, to a proxy's client or a
+tunnel's program. There the directions have other names (`shared.endpoints.directions`).
 """
 
 from abc import abstractmethod
@@ -29,8 +29,8 @@ class Emulator(Endpoint):
 
     Args:
         mtu: largest payload that passes [B].
-        directions: names of both directions. The fate of a flight's packet depends on its time,
-            because controllers send at different times; that of another program's on its number.
+        directions: names of both directions. With the names FLIGHT a packet's fate depends on its
+            time, because controllers send at different times; otherwise on its number.
         path: number of the session's path, from 0, in the record.
         header_bytes: see `Link`.
     """
@@ -58,7 +58,7 @@ class Emulator(Endpoint):
         self._opened = 0
         """Number of flows opened so far, which is the number of the next flow."""
         self._faults: set[str] = set()
-        """Tracebacks of errors in impairments of plug-ins: each is reported once."""
+        """Tracebacks of the reported errors of plug-ins: each error is reported once."""
 
     @abstractmethod
     def lanes(self) -> Iterable[tuple[Lane, Lane]]:

@@ -3,7 +3,7 @@
 Each direction has a list of impairments (`netem.impairments`), which modify the fate of a packet
 one after another. In a flight a fate depends on the seed, the direction, the flow and the time slot
 in which the packet enters, but not on earlier packets: so two controllers get the same network even
-if they send at different rates. For any other program it depends on the packet's number in its
+if they send at different rates. For other programs a fate depends on the packet's number in its
 flow, see `netem.impairments.draws`. Packets of a flight that enter in the same slot have different
 fates, by their rank in the slot: otherwise three CLOSEs sent at once would all be lost together.
 Control traffic is so sparse that nearly every packet is the first of its slot.
@@ -74,12 +74,12 @@ class Fates:
 
         Args:
             slot: time slot in which the packet enters.
-            rank: number of packets of the flow that entered in that slot before it; with
-                `by_number`, in any slot.
+            rank: number of packets of the flow that entered before this packet: in the same slot,
+                or, with `by_number`, in any slot.
         """
         fate = Fate(slot, rank)
-        # Built-in impairments are trusted: guarding against a plug-in takes a copy per impairment
-        # and packet.
+        # Built-in impairments are not guarded: a guard copies the fate for each impairment and #
+        # packet.
         if self._guarded:
             fate, fault = self._guarded(fate, self._impairments)
             self.fault = self.fault or fault

@@ -1,4 +1,4 @@
-"""Link: one direction of the network, with a bounded queue of packets by due time, and statistics.
+"""Link: one direction of the network, with statistics and a bounded queue ordered by due time.
 
 packet → bottleneck, if the direction has a finite rate → lost, or delayed → out
 """
@@ -20,14 +20,14 @@ if TYPE_CHECKING:
     from skytether.netem.bottleneck import Bottleneck
 
 QUEUE_MAX = 65536
-"""Largest number of packets queued in one direction; further ones are dropped, not counted as lost.
+"""Largest number of packets queued in one direction; further ones count as `overflowed`, not lost.
 """
 QUEUE_BYTES_MAX = 64 * 1024 * 1024
-"""Largest UDP payload queued in one direction, with any `network.mtu` [B]: with both directions
-full, and Python's overhead, netem stays below 256 MiB."""
+"""Largest UDP payload queued in one direction, whatever `network.mtu` is [B]. With both directions
+full, and Python's overhead, netem uses less than 256 MiB."""
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
-"""Bin width of the histogram of delays [ns]: the grid of the paper's delay."""
+"""Bin width of the histogram of delays [ns]: the resolution of the paper's delays."""
 DELAY_EDGES_MS = (20, 40, 60, 80, 100, 140, 200, 300, 400, 500, 600, 800, 1000, 2000)
 """Bin edges of the coarse histogram of delays for plots over time [ms]."""
 ERROR_BIN_NS = MILLISECOND_NS // 50
@@ -35,7 +35,7 @@ ERROR_BIN_NS = MILLISECOND_NS // 50
 QUEUEING_BIN_NS = MILLISECOND_NS
 """Bin width of the histogram of queueing times [ns]."""
 SLICE_BITS = 17
-"""Length of a slice of the queue as a power of two [ns]: 0.13 ms, in which 13 packets are due at
+"""Binary logarithm of the length of a slice of the queue [ns]. A slice of 0.13 ms has 13 packets at
 100 000 packets a second."""
 
 
@@ -49,13 +49,13 @@ class Lane:
     slot: int = -1
     """Time slot of the newest packet, counted from `began_ns`."""
     rank: int = 0
-    """Number of earlier packets in the slot of the newest packet."""
+    """Number of earlier packets in the newest packet's slot; with `Fates.by_number` in the flow."""
     taken: int = 0
     """Number of packets so far, lost packets included."""
     newest_out: int = -1
-    """Highest number of a packet that has left, or -1."""
+    """Largest number of the packets that have left, or -1."""
     latest_ns: int = 0
-    """Latest due time so far [ns], if packets stay in order."""
+    """Latest due time of a packet so far [ns]; only used if packets stay in order."""
 
 
 class Entered(NamedTuple):
@@ -97,9 +97,9 @@ class Counts:
     delay: Histogram = field(default_factory=lambda: Histogram(DELAY_BIN_NS))
     """Delays of forwarded packets, as drawn."""
     error: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN_NS))
-    """Lateness of forwarded packets beyond the drawn delay."""
+    """Time from a packet's due time until it was forwarded."""
     queueing: Histogram = field(default_factory=lambda: Histogram(QUEUEING_BIN_NS))
-    """Times that packets took to pass the bottleneck."""
+    """Time of each packet in the bottleneck."""
 
 
 QueuedPacket = tuple[int, int, Datagram, int, Lane, int, int, bool]
@@ -111,16 +111,15 @@ compared."""
 class Queue:
     """Queued packets, earliest due time first.
 
-    A single heap would be deep and spread over memory: with 44 000 packets, each entry and exit
-    touches a dozen of them. So packets are stored unordered in slices of time, and only the first
-    slice is a heap.
+    In a single heap of 44 000 packets, each entry and exit would touch a dozen packets, spread over
+    memory. So packets are stored unordered in slices of time, and only the first slice is a heap.
     """
 
     def __init__(self) -> None:
         self.front: list[QueuedPacket] = []
-        """Heap of the first packets; empty only if the queue is empty."""
+        """Heap of the packets due first; empty only if the queue is empty."""
         self._slice = 0
-        """Number of the first slice; packets of earlier slices are in `front` as well."""
+        """Number of the slice in `front`, which also has all packets of earlier slices."""
         self._later: dict[int, list[QueuedPacket]] = {}
         self._slices: list[int] = []
         self.size = 0
@@ -190,7 +189,7 @@ class Link:
         self.counts = Counts()
 
     def change(self, impairments: Impairments, *, now_ns: int) -> None:
-        """Use other impairments; with another rate, packets at the bottleneck queue again."""
+        """Use other impairments. If the rate changes, packets at the bottleneck queue again."""
         self._pass(now_ns)
         previous, self.impairments = self.impairments, impairments
         self._is_ordered = impairments.is_ordered
@@ -204,7 +203,7 @@ class Link:
         """Accept a packet whose peer is its destination; True if a packet may be due now."""
         counts, number, size = self.counts, lane.taken, len(datagram.payload)
         slot = (now_ns - lane.began_ns) // SLOT_NS
-        # Packets in the same slot differ by their rank; otherwise all would have the same fate.
+        # Without ranks, all packets in a slot would have the same fate.
         if lane.fates.by_number:
             lane.rank = number
         else:
@@ -267,7 +266,7 @@ class Link:
             self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)
             return
         if self._is_ordered:
-            # To keep the order, a packet waits for the earlier packets.
+            # To keep the order, a packet waits for all earlier packets.
             due_ns = lane.latest_ns = max(due_ns, lane.latest_ns)
         if fate.flipped is not None and size:
             counts.corrupted += 1
@@ -323,7 +322,7 @@ class Link:
                 at = direction, path, flow
                 rows.append(pack(*at, number, size, entered_ns, delay_ns, False, overtaken))
             out.append(datagram)
-        # All packets in one call: a call per packet would take longer than the work itself.
+        # One call for all packets: a call for each would take longer than the work itself.
         counts.forwarded += len(out)
         counts.delay.add_all(delays_ns)
         counts.error.add_all(errors_ns)
@@ -332,7 +331,7 @@ class Link:
         return out
 
     def next_due_ns(self) -> int | None:
-        """Time at which the next packet is due, or passes the bottleneck; None without packets."""
+        """Time at which a packet is next due, or passes the bottleneck; None without packets."""
         front = self._queue.front
         due_ns = front[0][0] if front else None
         if self._bottleneck is None:
@@ -348,7 +347,7 @@ class Link:
         return not self._is_full(size) and (bottleneck is None or bottleneck.has_room(size))
 
     def depth(self) -> int:
-        """Number of packets in queue and bottleneck, without the one being served."""
+        """Number of packets in queue and bottleneck, except the packet being served."""
         waiting = self._bottleneck.waiting if self._bottleneck else 0
         return self._queue.size + waiting
 

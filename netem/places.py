@@ -1,8 +1,8 @@
 """Places of netem: a limited number of flows, and the order in which new clients replace them.
 
 netem reads no payload, so it cannot distinguish a vehicle from an attacker who repeats a vehicle's
-packets. It counts exchanges instead. An exchange is a packet of the client followed by one of the
-server, and EXCHANGES of them earn a flow its place for EARNED_NS. One answer is not enough, because
+packets. netem counts exchanges instead. An exchange is a packet of the client followed by one of
+the server; EXCHANGES of them earn a flow its place for EARNED_NS. One answer is not enough, because
 anybody can cause one. If no place is free, a new client replaces the first of these:
 
     1. the oldest unearned flow, if it is unused for IDLE_NS
@@ -12,8 +12,8 @@ anybody can cause one. If no place is free, a new client replaces the first of t
     4. the oldest unearned flow of a host with more than HOST_FLOWS such flows
     5. the oldest unearned flow
 
-So a flow keeps its place only by exchanging packets at the rate of a slow vehicle, and a single
-host can keep at most HOST_FLOWS places from others.
+So a flow keeps its place only if it exchanges packets at least as often as a slow vehicle, and a
+single host can occupy at most HOST_FLOWS places that others need.
 """
 
 from collections import OrderedDict
@@ -29,11 +29,11 @@ EXCHANGES = 8
 EARNED_NS = 10 * SECOND_NS
 """Time for which a flow keeps a place that it has earned [ns]."""
 IDLE_NS = 5 * SECOND_NS
-"""Time without a packet after which a flow is replaced before the flows of a crowded host [ns]."""
+"""Time without a packet after which a flow is replaced before those of a crowded host [ns]."""
 HOST_FLOWS = 64
 """Number of flows above which a host's flows are replaced before those of other hosts."""
 TRIALS = 8
-"""Inverse of the share of places that hosts with more than HOST_FLOWS flows leave to others."""
+"""Inverse of the share of places that hosts with over HOST_FLOWS flows must leave to others."""
 
 
 @dataclass(slots=True)
@@ -50,17 +50,17 @@ class Flow:
     order: "Order"
     """Order that contains this flow: `Places._earned` or `Places.others`."""
     laps: int
-    """Number of earlier addresses with the same first packet (a loop): `Proxy._laps`."""
+    """Number of earlier addresses with the same first packet, see `Proxy._laps`."""
     asks: bool = False
     """Whether a packet of the client has arrived since the newest exchange."""
     exchanges: int = 0
     """Number of exchanges since the flow last earned its place."""
     earned_ns: int = 0
-    """Time at which the flow last earned its place."""
+    """Time at which the flow last earned its place [ns]."""
 
 
 class Order:
-    """Flows ordered by time, oldest first: one order for all, and one for each host."""
+    """Flows ordered by time, oldest first: all flows, and the flows of each host."""
 
     def __init__(self) -> None:
         self.flows: OrderedDict[Address, Flow] = OrderedDict()
@@ -102,7 +102,7 @@ class Order:
 class Places:
     def __init__(self, count: int) -> None:
         self._trials = count // TRIALS
-        """Number of places that hosts with more than HOST_FLOWS flows leave to others."""
+        """Number of places that hosts with over HOST_FLOWS flows must leave to others."""
         self._earned = Order()
         """Flows that have earned their place, by the time at which they last earned it."""
         self.others = Order()
@@ -136,7 +136,7 @@ class Places:
         return flow
 
     def _crowding(self, host: str) -> Flow | None:
-        """Flow, of a host with more than HOST_FLOWS flows, that a new client of `host` replaces."""
+        """Flow that a new client of `host` replaces, of a host with more than HOST_FLOWS flows."""
         earned, others = self._earned, self.others
         if earned.count(host) + others.count(host) > HOST_FLOWS and others.count(host):
             return others.oldest(host)

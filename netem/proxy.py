@@ -5,9 +5,9 @@ server, so that the server's answers are sent back to the right client. As in th
 server to client, downlink is client to server.
 
 If no place is free for a new client, it replaces a flow chosen by `places`. A server address that
-leads back to netem is detected: until the server has sent its first packet, a packet that has
-arrived from LAPS_MAX new addresses, one after another, opens no further flow. The first packet that
-is too long, and the first that does not reach the server, are reported.
+leads back to netem is detected: before the server's first packet, a packet that has arrived from
+LAPS_MAX new addresses, one after another, opens no further flow. The first packet that is too long,
+and the first that does not reach the server, are reported.
 """
 
 from collections import OrderedDict
@@ -32,7 +32,7 @@ from skytether.shared.telemetry.record import Recorder
 FLOWS_MAX = 512
 """Default largest number of clients at once; packets of further clients are dropped and counted."""
 LAPS_MAX = 16
-"""Largest number of flows that copies of one packet, from new addresses, open before an answer."""
+"""Largest number of flows that copies of one packet open before the server's first answer."""
 
 
 class Proxy(Emulator):
@@ -67,13 +67,13 @@ class Proxy(Emulator):
         self._is_too_long = False
         """Whether a packet that is too long was reported."""
         self._is_unreachable = False
-        """Whether packets to the server have failed since its last answer."""
+        """Whether a packet to the server could not be delivered since the server's last answer."""
         self._passed: OrderedDict[int, tuple[int, Address]] = OrderedDict()
         """Result of `_laps` and latest client of each of the newest packets, by Python's hash of
-        the packet (64 bits, with a secret key of the process); empty once the server answers."""
+        the payload (64 bits, with a secret key of the process); empty after the server's answer."""
         self.refused = 0
-        """Number of packets from clients without a flow, or to a flow's socket but not from the
-        server."""
+        """Number of dropped packets: from clients without a flow, or to a flow's socket from others
+        than the server."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         payload, peer, socket = datagram
@@ -174,7 +174,7 @@ class Proxy(Emulator):
 
 
 def merged(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Figures of the netems of one session, one for each path, as those of one netem.
+    """Figures of one session's netems, one for each path, combined as if of one netem.
 
     Counts of several paths are added up, and `by_path` has the figures of each, from 1.
     """
@@ -184,7 +184,7 @@ def merged(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _added(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Sums of the counts of equal name, also within groups; without quantiles and maxima."""
+    """Sums of the counts with the same name, also in groups; without quantiles and maxima."""
     total: dict[str, Any] = {}
     for name in dict.fromkeys(name for one in each for name in one):
         values = [one[name] for one in each if name in one]

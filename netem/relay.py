@@ -2,9 +2,9 @@
 
 A stream has no packets that could be lost. Each piece of a stream passes the same impairments as a
 packet; a piece that would be lost holds up its stream and is tried again every RETRY_NS, similar to
-a retransmission. Pieces never overtake each other, and are neither copied nor damaged. A full queue
-reads nothing from its connections until it has space. This is no packet loss: TCP's own reaction to
-loss only appears if its packets are emulated, see `netem.tunnel`.
+a retransmission. Pieces never overtake each other, and are neither copied nor damaged. While a
+queue is full, nothing is read from its connections. TCP itself sees no packet loss, and does not
+react to it; for that its packets must be emulated, see `netem.tunnel`.
 
 The ends of connection N are the peers `(CLIENT, N)` and `(SERVER, N)`; an empty piece means that an
 end sends no more.
@@ -30,7 +30,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 TRY = 1 << 32
-"""Number added to that of a piece at each new try, so that the new try has its own random loss."""
+"""Number added to a piece's number at each new try, so that the try has its own random loss."""
 RETRY_NS = 200 * MILLISECOND_NS
 """Time after which a piece that a link would have lost is sent again [ns]: the smallest
 retransmission time-out of Linux."""
@@ -56,7 +56,7 @@ class HalfConnection:
         """Time at which the first held piece is tried again; None while it waits for space."""
 
     def loses(self, now_ns: int) -> bool:
-        """Whether the first held piece would be lost now if it was a packet."""
+        """Whether the first held piece would be lost now if it were a packet."""
         slot = (now_ns - self.lane.began_ns) // SLOT_NS
         number = self.lane.taken + TRY * self.tries
         return Fates.at(self.lane.fates, slot, number).lost  # `LosslessFates` would never lose it
@@ -85,7 +85,7 @@ class Relay(Emulator):
         self._holding: dict[Address, HalfConnection] = {}
         """Streams with held pieces, in the order in which they are tried."""
         self._ended: set[Address] = set()
-        """Sources whose end-of-stream piece has left the link."""
+        """Sources of streams whose end (an empty piece) has left the link."""
         self._retries = 0
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:

@@ -1,7 +1,7 @@
 """Tunnel: the network of one program, which carries the program's IP packets both ways.
 
-As for a vehicle, uplink is to the program and downlink is from it. A program that sends the same
-packets gets the same network in each run, see `netem.impairments.draws`.
+The uplink leads to the program, as it does to a vehicle; the downlink leads from the program. A
+program that sends the same packets gets the same network in each run, see `impairments.draws`.
 """
 
 from collections import OrderedDict
@@ -18,7 +18,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 FLOWS_MAX = 16_384
-"""Largest number of flows stored; a further one replaces the flow that was silent longest."""
+"""Largest number of flows stored; a further flow replaces the one silent longest."""
 
 
 class Tunnel(Emulator):
@@ -37,11 +37,11 @@ class Tunnel(Emulator):
         self._flows: OrderedDict[bytes, tuple[Lane, Lane]] = OrderedDict()
         """Uplink and downlink of each flow by its key; the flow that was silent longest is first.
 
-        A flow is packets with the same protocol, addresses and ports, both ways."""
+        A flow is all packets, both ways, with the same protocol, addresses and ports."""
         self._began_ns = 0
-        """Time of the first packet, at which outages and traces begin, for all flows."""
+        """Time of the first packet [ns], at which outages and traces begin for all flows."""
         self._has_ended = self._is_cut = False
-        """Whether an empty payload has come from PROGRAM, and whether one from OUTSIDE."""
+        """Whether an empty payload has arrived: from PROGRAM, and from OUTSIDE."""
         self.refused = 0
         """Number of packets that were not IP packets."""
 

@@ -61,11 +61,11 @@ class ServerOptions(ProcessOptions):
     vehicles: Annotated[int, Argument(metavar="N")] = VEHICLES_MAX
     """Largest number of vehicles at once, per worker."""
     workers: Annotated[int, Argument(metavar="N")] = 1
-    """Number of processes that share the address and the vehicles, best one per core. With several,
-    each writes its own numbered files, as in RECORD.1 or RECORD.1.mcap, and worker N serves metrics
-    at PORT + N - 1."""
+    """Number of processes that share the address and the vehicles; one per core is best. With
+    several, each writes its own numbered files, as in RECORD.1 or RECORD.1.mcap, and worker N
+    serves metrics at PORT + N - 1."""
     keys: Path | None = None
-    """File with the keys of all vehicles, made by `skytether keygen`. Without it the link is
+    """File with the keys of all vehicles, made by `skytether keygen`. Without keys the link is
     plaintext, which is refused if other machines can reach the address."""
     insecure: bool = False
     """Accept plaintext even if other machines can reach the address: anybody there can fly
@@ -111,8 +111,8 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _ready(scenario: Scenario) -> None:
-    """Load the compiled planner and all modules that a vehicle's packet may need, before workers
-    are forked, so that they share the memory, and before the first tick, which has to be on time.
+    """Load the compiled planner and all modules that a vehicle's packet may need: before workers
+    are forked, so that they share memory, and before the first tick, so that it is on time.
     """
     for room in (assignment.ROOM, routes.ROOM):
         with suppress(ConfigError):  # without the module its messages are refused

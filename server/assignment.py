@@ -13,7 +13,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Message, Observation, RoomMessage
 
 ROOM, MESSAGES = "skytether.server.standby", "skytether.shared.wire.lead"
-"""Module for vehicles with two servers, and module of the messages of such vehicles."""
+"""Module that plans for vehicles with two servers, and module of their messages."""
 
 
 class Decider(Protocol):
@@ -50,11 +50,11 @@ class Assignment:
 
     def __init__(self, controller: Decider, limits: Any) -> None:
         self.controller, self.limits = controller, limits
-        """Limits of motions, see `Scheme.limits`; None if vehicles may follow different servers."""
+        """Limits of motions, see `Scheme.limits`; None if not all vehicles need the same leader."""
         self.changes = 0
         """Number of changes of `limits` in flight."""
         self.changed_ns: int | None = None
-        """Time of the newest change of `limits`."""
+        """Time of the newest change of `limits` [ns]."""
 
     def change(self, limits: Any, now_ns: int) -> None:
         if limits is not self.limits:
@@ -62,11 +62,11 @@ class Assignment:
             self.changes += 1
 
     def takes(self, message: Message) -> bool:
-        """Whether a message says which server plans for its vehicle."""
+        """Whether a message is about which server plans for a vehicle."""
         return type(message).__module__ == MESSAGES
 
     def of_several(self) -> "Assignment":
-        """Assignment of vehicles of which some have several servers."""
+        """Assignment if some vehicles have several servers."""
         assignment: Assignment = load(ROOM, "a standby server").AssignmentOfTwo(self)
         return assignment
 
@@ -83,7 +83,7 @@ class Assignment:
         raise ProtocolError(Drop.FIELD)
 
     def signed(self, session: Any, plan: bytes) -> bytes:
-        """Encoded plan as sent to a vehicle; unchanged in this base class."""
+        """Encoded plan as it is sent to a vehicle; unchanged in this base class."""
         return plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterable[Datagram]:

@@ -4,13 +4,13 @@ The trigger decides whether a vehicle requests a packet. The budget grants reque
 bytes, in this order:
 
 1. urgent packets: a plan that replaces a heartbeat, and the first plan of a vehicle. They are
-   always granted, like heartbeats, at the expense of the others.
-2. vehicles without a packet for WAIT_S, longest wait first, so that none is neglected;
-3. all others, first those with the largest figure of the trigger per byte.
+   always granted, like heartbeats, and leave fewer bytes for the others;
+2. vehicles that got no packet for WAIT_S, longest wait first, so that none is neglected; 3. all
+other vehicles, those with the largest figure of the trigger per byte first.
 
-It is a token bucket: b ← b + r Δt, within ± r BURST_S, minus the bytes sent, headers included;
-urgent packets may make it negative. So a window of T seconds has at most r (T + BURST_S) bytes of
-packets that are not urgent. The rate r is `control.shared_bytes_per_s`.
+The budget is a token bucket with b bytes: b ← b + r Δt, within ± r BURST_S, minus the bytes sent,
+headers included. Urgent packets may make b negative. So a window of T seconds has at most r (T +
+BURST_S) bytes of packets that are not urgent. The rate r is `control.shared_bytes_per_s`.
 
 A refused vehicle asks again at the next step. The ranking covers all blocks of vehicles, with the
 latest request of each vehicle, at most one step old.
@@ -30,7 +30,7 @@ BURST_S = 0.1
 WAIT_S = 1.0
 """Time without a packet after which a vehicle takes precedence [s]."""
 NEVER = -2
-"""Value of `_asked` for a vehicle without a refused request: earlier than any tick."""
+"""Value of `_asked` for a vehicle without a refused request; less than any tick's number."""
 GUESS_BYTES = 100
 """Assumed size of a packet, with headers, until the first is sent [B]."""
 
@@ -51,9 +51,9 @@ class SharedBudget:
         """Size of the newest packet to each vehicle, with headers [B]; shape (capacity,)."""
         self._tick = 0
         self._asked = np.full(capacity, NEVER)
-        """Tick of each vehicle's latest refused request; shape (capacity,)."""
+        """Number of the tick of each vehicle's latest refused request; shape (capacity,)."""
         self._gain = np.zeros(capacity)
-        """Figure that the trigger compared at the refused request, per byte; shape (capacity,)."""
+        """Figure of the trigger at the latest request, per byte of a packet; shape (capacity,)."""
         self._waited_s = np.zeros(capacity)
         """Time since the last packet if WAIT_S or more, otherwise 0 [s]; shape (capacity,)."""
         self.deferred = 0
@@ -67,7 +67,7 @@ class SharedBudget:
         self._filled_ns = now_ns
         rate = self.bytes_per_s
         tokens, most = self._tokens - self._spent + rate * passed_s, rate * BURST_S
-        # The negative balance is bounded too, so that urgent packets cannot delay plans for long.
+        # A negative balance is bounded, too, so that urgent packets cannot delay plans for long.
         self._tokens, self._spent = min(max(tokens, -most), most), 0
         self._tick += 1
 
@@ -92,8 +92,8 @@ class SharedBudget:
         # np.lexsort sorts by its last key first: longest wait, then largest gain.
         order = np.lexsort((-self._gain[waiting], -self._waited_s[waiting]))
         ranked = waiting[order]
-        # The first request that exceeds the budget stops all after it: otherwise smaller packets
-        # could overtake it for ever.
+        # After the first request that exceeds the budget, none is granted: otherwise smaller #
+        # packets could overtake it for ever.
         goes = ranked[np.cumsum(self._bytes[ranked]) <= left]
         chosen = urgent & event | np.isin(rows, goes) & asks
         late = int(asks.sum() - (chosen & asks).sum())

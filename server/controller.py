@@ -1,11 +1,11 @@
-"""Algorithm of the server: everything computed at a step for n vehicles, without any networking.
+"""Algorithm of the server: everything that it computes at a step for n vehicles; no networking.
 
     observations → x̂(k), x̂(k+d) (`schemes`) → X_p(k+d), U(k+d), V, cost gap, deviation
     (`mpc.hierarchical`) → event? (`trigger`) → plans are sent and remembered.
 
 The schemes "predictive" and "none" have d = 0. With "trajectory", `schemes.trajectory` plans the
-spline to be followed; on a mission, `missions.mission_planner`. Plans are made for every vehicle at
-every step, because planning takes a small part of a step's time.
+spline that the vehicle follows; on a mission, `missions.mission_planner` does. The server plans for
+every vehicle at every step, because planning takes a small part of a step's time.
 """
 
 from collections import Counter
@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 
 PLANS, OBSERVATION, DELAY, UNSOLVED, OTHER_SERVER = map(int, Idle)
 BLOCK = 128
-"""Number of vehicles planned for together: their data stay in the cache, and all arrays are below
-128 KiB, from which on the C library requests new memory from the kernel for each."""
+"""Number of vehicles planned for together. Their data fit into the cache, and each array is below
+128 KiB; for a larger one the C library requests new memory from the kernel every time."""
 
 
 class Decisions(msgspec.Struct, frozen=True):
@@ -84,7 +84,7 @@ class Controller:
         self._clock = clock
         self.desired = Desired(scenario, terms, capacity, block, references)
         self.faults: list[str] = []
-        """Tracebacks of the first error of each plug-in, to be reported."""
+        """Tracebacks of plug-ins' errors, the first of each plug-in, that are not reported yet."""
         fleet = Fleet(
             scenario,
             terms,
@@ -113,23 +113,23 @@ class Controller:
         self.change_trigger(control)
         self._stopwatch = stopwatch
         self.last_step = np.full(capacity, -1, dtype=np.int64)
-        """Latest step decided for each vehicle, or -1; shape (capacity,)."""
+        """Latest step of each vehicle with a decision, or -1; shape (capacity,)."""
         self.observed_step = self.scheme.observed_step
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.idle = np.zeros(capacity, dtype=np.int64)
-        """Reason for the missing plan of each vehicle, one of `Idle`; shape (capacity,)."""
+        """Why each vehicle gets no plan, as a value of `Idle`; shape (capacity,)."""
         self._is_own = np.ones(capacity, dtype=np.bool_)
         """Whether this server plans for each vehicle; shape (capacity,)."""
         self._plans_due: dict[int, int] = {}
-        """Number of plans, by row, that are still due independently of the trigger."""
+        """Number of plans still to be sent to a vehicle whatever the trigger says, by row."""
         self._takes = np.ones(capacity, dtype=np.bool_)
         """Whether each vehicle accepts horizons, by its newest observation; shape (capacity,)."""
         self._counts: Counter[str] = Counter()
         shared = control.shared_bytes_per_s
         self._budget: SharedBudget | None = None
         self.charge: Callable[..., None] | None = None
-        """Function called with the row and the datagrams of each packet, `SharedBudget.charge`;
-        None unless all vehicles share a rate."""
+        """`SharedBudget.charge`, called with the row and the datagrams of each packet; None unless
+        all vehicles share a rate."""
         if shared:
             module = load("skytether.server.budget", "control.shared_bytes_per_s")
             self._budget = module.SharedBudget(shared, capacity)
@@ -148,7 +148,7 @@ class Controller:
         self.faults += filter(None, [fault])
 
     def use_trigger(self, trigger: Trigger) -> None:
-        """Use another trigger from the next step on; it starts without data of sent plans."""
+        """Use another trigger from the next step on; it knows no plans sent before."""
         terms, self._trigger = self._terms, trigger
         self.doubts = trigger.doubts
         """Whether the trigger needs the costs for cases in which horizons are lost."""
@@ -185,8 +185,8 @@ class Controller:
     def assign(
         self, row: int, message: RoomMessage | None, *, is_own: bool = True, plans_due: int = 0
     ) -> None:
-        """Note whether this server plans for a vehicle; if so, it sends a plan at once, even an
-        unchanged one. See `assignment.Decider`.
+        """Note whether this server plans for a vehicle. If so, the server sends a plan at once,
+        even an unchanged plan. See `assignment.Decider`.
         """
         self._is_own[row] = is_own
         if is_own:
@@ -211,8 +211,8 @@ class Controller:
         return is_stored
 
     def begin_tick(self, tick_ns: int, now_ns: int, due: list[int]) -> None:
-        """Begin the tick of the time `tick_ns`; `due`: rows of the vehicles to which a heartbeat is
-        due unless a plan is sent.
+        """Begin the tick of the time `tick_ns`; `due`: rows of the vehicles that get a heartbeat at
+        this tick unless they get a plan.
         """
         self.desired.tick(tick_ns)
         if self._budget:
@@ -268,14 +268,13 @@ class Controller:
             event,
         )
         if self._budget:
-            # A trigger without a comparison, such as `periodic`, has no figure by which to rank
-            # vehicles.
+            # A trigger without a threshold, such as `periodic`, has no figure to rank vehicles by.
             compared = verdict.figure if verdict.compares else figures["cost_gap"]
-            # A vehicle without a plan cannot wait for free bytes of the budget.
+            # A vehicle without a plan must not wait for the budget.
             urgent = self._heartbeat_due[rows] | figures["fresh"] | (self._sent_step[rows] < 0)
             event = self._budget.choose(rows, event, urgent, compared, situation.since_sent_s)
             events = int(np.count_nonzero(event))
-        # Called after the budget: the scheme "committed" may replay only horizons that are sent.
+        # After the budget's choice: the scheme "committed" must replay only horizons that are sent.
         self.scheme.remember(rows, step, predicted, event)  # eq. (12)
         _note_sent(rows, step, event, self._sent_step)
         if events == n:  # no vehicle has to be left out
@@ -329,7 +328,7 @@ def _able(
         elif step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:
-            # On arrival the horizon would have ended, or would be refused as too late.
+            # A horizon would have ended on arrival, or the vehicle would refuse it as too late.
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
         count += able[i]
@@ -349,9 +348,9 @@ def _withhold(
     idle: I1,
     event: B1,
 ) -> tuple[int, int]:
-    """Cancel events whose plan cannot be used, with the reason in `idle`, and set `last_step`.
+    """Cancel events with unusable plans, noting why in `idle`, and set `last_step`.
 
-    A plan is not sent if its observation would be too old at the plan's start, or if the vehicle
+    A plan is unusable if its observation would be too old at the plan's start, or if the vehicle
     does not accept horizons.
 
     Returns:

@@ -1,7 +1,7 @@
 """The server as an endpoint: it receives and sends datagrams, and has a tick every Δt.
 
-It combines `reception` (messages of vehicles), `sessions`, and `tick` with `controller` (decisions
-for all vehicles).
+The endpoint combines `reception` (messages of vehicles), `sessions`, and `tick`, which calls
+`controller` (decisions for all vehicles).
 """
 
 from collections import Counter
@@ -37,8 +37,8 @@ from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 VEHICLES_MAX = 64
 """Default largest number of vehicles at once."""
 LATEST_NS = 2 * SECOND_NS
-"""Time for which a server that was asked to end waits, after the last motion, for observations of
-the vehicles at rest [ns]."""
+"""Time for which a server that has to end waits, after the last motion, for observations which show
+that the vehicles are at rest [ns]."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
@@ -50,14 +50,14 @@ class Server(Endpoint):
     """Plans for every vehicle that requests a session.
 
     Args:
-        boot_id: number unique to this run of the server.
+        boot_id: number that only this run of the server has.
         entropy: returns this many random bytes.
         recorder: receives one row per tick and vehicle.
         plan_recorder: receives one row per horizon sent, see `record.plan_columns`.
         stopwatch: measures the parts of a tick; the server itself reads no clock.
-        references: desired trajectory of each vehicle, by its number; default: the scenario's for
-            all.
-        planning: calls planners of plug-ins.
+        references: function from a vehicle's number to its reference; default: the scenario's
+            reference for all.
+        planning: function that calls planners of plug-ins.
     """
 
     def __init__(
@@ -143,8 +143,8 @@ class Server(Endpoint):
         if tick_ns is None:
             return
         if now_ns >= self._expire_ns:
-            # At full seconds of the clock: the time at which a vehicle is forgotten does not depend
-            # on other vehicles.
+            # Only at full seconds of the clock, so that the time at which a vehicle is forgotten #
+            # does not depend on other vehicles.
             self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             for session in self.sessions.expire(now_ns):
                 self._events.append(SessionEnded(vehicle=session.vehicle))
@@ -156,7 +156,7 @@ class Server(Endpoint):
             self._grid.rest()
 
     def leave(self, *, now_ns: int) -> int:
-        """See `Endpoint`; on a mission, wait until all vehicles rest or follow another server."""
+        """See `Endpoint`; on a mission, waits until all vehicles rest or follow another server."""
         self._leaves = True
         steps = self.controller.scheme.leave()
         moving = tuple(each.vehicle for each in self.sessions if not self._rests(each))

@@ -16,7 +16,7 @@ class ReplyPath(Protocol):
 
 
 class GateCall(NamedTuple):
-    """A message and its sender."""
+    """Message of a vehicle, and its sender."""
 
     payload: bytes
     vehicle: int | None
@@ -31,22 +31,22 @@ class Gate(Protocol):
     """Converts datagrams of vehicles to messages."""
 
     def open(self, datagram: Datagram, *, now_ns: int) -> GateCall | None:
-        """Message in a datagram; None if it was part of a handshake.
+        """Message in a datagram; None if the datagram was part of a handshake.
 
         Raises:
             ProtocolError: the datagram is not from a vehicle.
         """
 
     def repeated(self, datagram: Datagram) -> int | None:
-        """Number of the vehicle whose recent packet a datagram repeats; None if it repeats no such
-        packet.
+        """Number of the vehicle whose recent packet a datagram repeats; None if the datagram
+        repeats none.
         """
 
     def admit(self, call: GateCall, *, now_ns: int) -> None:
-        """Accept the sender of this HELLO: from now on its packets are opened."""
+        """Accept the sender of this HELLO: from now on the gate decrypts the sender's packets."""
 
     def outbox(self) -> list[Datagram]:
-        """Datagrams of the gate itself; each is returned once."""
+        """Datagrams that the gate itself sends; each is returned once."""
 
 
 class PlainGate:

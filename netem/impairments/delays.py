@@ -1,5 +1,5 @@
-"""Impairments that delay packets by a random distribution. Several in one direction add up;
-`distributions` has others.
+"""Impairments that delay packets by a random distribution. Several delays in one direction add up.
+`distributions` has further distributions.
 
 A uniform random number becomes a delay by the distribution's quantile function. With
 `correlation_s` the random number is kept for a random time (`Draws.lasting`): the autocorrelation
@@ -78,11 +78,10 @@ class Paper(Delay):
 
 @lru_cache(maxsize=64)
 def _poisson(mean: float) -> tuple[int, Sequence[float]]:
-    """Cumulative probabilities of a Poisson distribution, without those near 0 and near 1.
+    """Cumulative probabilities of a Poisson distribution, except values near 0 and near 1.
 
     Returns:
-        number that the first probability belongs to, and the probabilities P(N ≤ number), P(N ≤
-            number + 1), …
+        number n of the first probability, and the probabilities P(N ≤ n), P(N ≤ n + 1), …
     """
     if mean == 0.0:  # avoids log(0)
         return 0, (1.0,)

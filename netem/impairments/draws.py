@@ -5,10 +5,10 @@ SLOT_NS in which it enters, counted from the start of the flow. It does not depe
 packets. So two controllers are compared on the same network, even if they send at different rates.
 Packets of one flow in one slot are numbered by rank.
 
-Two runs of any other program send the same packets, but never in the same milliseconds. So there a
-packet's rank is its number in its flow, and its own random numbers depend on that number; lasting
-effects depend on the time since the flow's first packet, or, if they are common to all flows of a
-program (`netem.tunnel`), since the program's first packet.
+Two runs of any other program send the same packets, but never in the same milliseconds. So a
+packet's rank is then its number in its flow, and its own random numbers depend on that number.
+Lasting effects depend on the time since the flow's first packet, or, if they are common to all
+flows of a program (`netem.tunnel`), since the program's first packet.
 """
 
 from dataclasses import dataclass
@@ -35,15 +35,15 @@ class Fate:
     slot: int = 0
     """Slot in which the packet enters, counted from the start of its flow."""
     rank: int = 0
-    """Number of earlier packets of the same flow in the same slot."""
+    """Number of earlier packets of the flow, in the same slot or in all (`Fates.by_number`)."""
     delay_ns: int = 0
-    """Delay [ns], also drawn for a lost packet."""
+    """Delay [ns]; a lost packet has one, too."""
     lost: bool = False
     """Whether the packet is lost."""
     copies: int = 0
     """Number of extra copies that arrive."""
     flipped: float | None = None
-    """Position of a flipped bit, as a fraction below 1 of the packet's length; None: no flip."""
+    """Position of a flipped bit as a share of the packet's length, below 1; None: no flip."""
 
     @property
     def time_s(self) -> float:
@@ -52,7 +52,7 @@ class Fate:
 
 
 class Stream:
-    """Pairs of uniform random numbers, as a hash of names and a place.
+    """Pairs of uniform random numbers, each pair a hash of names, a place and a number.
 
     Args:
         names: seed, direction, flow and purpose.
@@ -77,7 +77,7 @@ class Stream:
         """
         if place == self._at and number == self._number:
             return self._pair
-        # The copy saves hashing the names again for each packet.
+        # A copy of the hash: the names need not be hashed again for each packet.
         drawn = self._seeded.copy()
         drawn.update(_PLACE.pack(place, number))
         one, other = _DRAWN.unpack(drawn.digest())
@@ -116,10 +116,10 @@ class Draws:
     def lasting(self, fate: Fate, mean_s: float) -> float:
         """Random number below 1 that is redrawn at the events of a Poisson process.
 
-        Its distribution is uniform and its autocorrelation falls exponentially. It depends on the
-        newest event only. To find that event, the events of cells of length `mean_s` are drawn one
-        cell after another, backwards from the packet's time. A cell has one event on average, and
-        none with probability 1/e.
+        The number's distribution is uniform, and its autocorrelation falls exponentially. It
+        depends on the newest event only. To find that event, time is divided into cells of length
+        `mean_s`, and the events of one cell after another are drawn, backwards from the packet's
+        time. A cell has one event on average, and none with probability 1/e.
 
         Args:
             fate: the packet.

@@ -1,4 +1,4 @@
-"""Impairments of plug-ins with their errors caught: an impairment that fails has no effect."""
+"""Guard against errors of plug-ins: an impairment that fails has no effect."""
 
 import traceback
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ def fate_of(fate: Fate, impairments: Iterable[tuple[Impairment, Draws]]) -> tupl
     """Fate of a packet after all impairments, and the traceback of the first error, or empty."""
     fault = ""
     for impairment, draws in impairments:
-        # On a copy: a plug-in that fails half-way must have no effect.
+        # Each impairment changes a copy: if it fails half-way, it must have no effect.
         tried = replace(fate)
         try:
             impairment(tried, draws)

@@ -20,7 +20,7 @@ from skytether.netem.impairments.draws import Draws, Fate
 from skytether.shared.scenario.registry import IMPAIRMENTS
 
 impairment = IMPAIRMENTS
-"""Decorator of an impairment: a class whose arguments are written in the scenario."""
+"""Decorator for an impairment's class, whose arguments are given in the scenario."""
 
 Time = Annotated[float, Meta(ge=0, le=3600)]
 """Time from 0 to an hour [s]."""
@@ -29,13 +29,13 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Impairment:
-    """Base class of an effect of the network on packets. It must not store anything between
-    packets.
+    """Base class of an effect of the network on packets. An impairment must not store anything
+    between packets.
     """
 
     kind: Literal["delay", "loss", "other"] = "other"
-    """Kind of effect. The first delay and the first loss keep their random numbers when others are
-    added."""
+    """Kind of effect. The first delay and the first loss of a direction keep their random numbers
+    when other impairments are added."""
     least_s: float = 0.0
     """Smallest delay that the impairment adds [s]."""
     mean_s: float = 0.0

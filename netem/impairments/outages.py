@@ -11,7 +11,7 @@ from skytether.shared.base.units import seconds_to_ns
 
 @impairment(name="gilbert_elliott")
 class GilbertElliott(Impairment):
-    """Loses packets while a channel is bad: a share of the time, for burst_s on average."""
+    """Loses packets while a channel is bad: a share of the time, in bursts of mean burst_s."""
 
     kind = "loss"
 
@@ -20,8 +20,7 @@ class GilbertElliott(Impairment):
     ) -> None:
         self._share, self._bad, self._good = share, loss_bad, loss_good
         self.loss = share * loss_bad + (1.0 - share) * loss_good
-        # A redrawn state is bad again with the probability `share`, so bursts last burst_s on
-        # average.
+        # A redrawn state is bad again with the probability `share`: so the mean burst is burst_s.
         self._cell_s = burst_s * (1.0 - share)
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
@@ -54,7 +53,7 @@ class Outage(Impairment):
 
 @impairment(name="outages")
 class Outages(Impairment):
-    """Loses all packets for a random time of mean for_s, then none for one of mean every_s."""
+    """Loses all packets for random times of mean for_s, after random gaps of mean every_s."""
 
     def __init__(self, every_s: Annotated[float, Meta(ge=0.001, le=3600)], for_s: Time) -> None:
         self.loss = for_s / (every_s + for_s)
@@ -67,7 +66,7 @@ class Outages(Impairment):
 
 @impairment(name="delivered")
 class Delivered(Impairment):
-    """Delivers a flow's packets within delay_s, from at_s on for for_s; four numbers a stretch."""
+    """Delivers packets within delay_s; each stretch of time is flow, at_s, for_s, delay_s."""
 
     def __init__(self, *stretches: Annotated[float, Meta(ge=0, le=86400)]) -> None:
         each = list(zip(*(iter(stretches),) * 4, strict=False))

@@ -1,6 +1,6 @@
 """Impairments that depend on other packets: finite rates with queues, and order.
 
-They only describe the queue; `netem.bottleneck` implements it.
+These classes only describe queues; `netem.bottleneck` implements them.
 """
 
 from typing import Annotated, Literal
@@ -25,7 +25,7 @@ Served = Literal["first", "fair"]
 
 @impairment(name="ordered")
 class Ordered(Impairment):
-    """Keeps packets of a flow in order: a packet waits for those before it."""
+    """Keeps packets of a flow in order: each packet waits for all earlier packets."""
 
     is_ordered = True
 

@@ -29,7 +29,7 @@ from skytether.shared.scenario.registry import File
 
 @impairment(name="trace")
 class Trace(Impairment):
-    """Delays and loses packets like a recorded path; the recording is used repeatedly or once."""
+    """Delays and loses packets like a recorded path; the recording is repeated, or used once."""
 
     kind = "delay"
 
@@ -51,8 +51,8 @@ class Trace(Impairment):
         self.loss = float(recorded.lost.mean())
 
     def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
-        """Apply the file: a packet sent between two packets of the file is lost if the nearer of
-        them was lost.
+        """Apply the recording: a packet is lost if the packet sent at the nearest time in the
+        recording was lost.
         """
         time_s = fate.time_s % self._loop_s if self._loop_s else fate.time_s
         fate.delay_ns += seconds_to_ns(interpolated(time_s, self._times_s, self._delays_s))
