@@ -78,7 +78,7 @@ class Fates:
                 or, with `by_number`, in any slot.
         """
         fate = Fate(slot, rank)
-        # Built-in impairments are not guarded: a guard copies the fate for each impairment and #
+        # Built-in impairments are not guarded: a guard copies the fate for each impairment and
         # packet.
         if self._guarded:
             fate, fault = self._guarded(fate, self._impairments)

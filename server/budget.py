@@ -92,7 +92,7 @@ class SharedBudget:
         # np.lexsort sorts by its last key first: longest wait, then largest gain.
         order = np.lexsort((-self._gain[waiting], -self._waited_s[waiting]))
         ranked = waiting[order]
-        # After the first request that exceeds the budget, none is granted: otherwise smaller #
+        # After the first request that exceeds the budget, none is granted: otherwise smaller
         # packets could overtake it for ever.
         goes = ranked[np.cumsum(self._bytes[ranked]) <= left]
         chosen = urgent & event | np.isin(rows, goes) & asks

@@ -143,7 +143,7 @@ class Server(Endpoint):
         if tick_ns is None:
             return
         if now_ns >= self._expire_ns:
-            # Only at full seconds of the clock, so that the time at which a vehicle is forgotten #
+            # Only at full seconds of the clock, so that the time at which a vehicle is forgotten
             # does not depend on other vehicles.
             self._expire_ns = (now_ns // SECOND_NS + 1) * SECOND_NS
             for session in self.sessions.expire(now_ns):

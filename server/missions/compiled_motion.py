@@ -1,8 +1,8 @@
-"""Motions in kernels: state at a step, and bounds of speed and curvature.
+"""Functions of motions for kernels: state at a step, and bounds of speed and curvature.
 
-Vertical distances may count less than those in the plane: coordinates are first multiplied by
-`MotionMetric.scale`. In this metric a sphere is an ellipsoid that is higher than wide, because of
-downwash.
+Because of downwash, vertical distances may count less than horizontal ones: coordinates are
+multiplied by `MotionMetric.scale` first. A sphere of scaled coordinates is an ellipsoid that is
+higher than wide.
 """
 
 from typing import NamedTuple
@@ -16,7 +16,7 @@ from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 
 class MotionMetric(NamedTuple):
     scale: F1
-    """Factor of each coordinate in distances; shape (axes,)."""
+    """Factor of each coordinate when distances are computed; shape (axes,)."""
     dt_s: float
 
 
@@ -26,7 +26,7 @@ class Extent(NamedTuple):
     speed: float
     """Largest speed, scaled [m/s]."""
     bend: float
-    """Largest distance of the motion from its straight pieces, SAMPLES per interval, scaled [m]."""
+    """Largest distance of the motion from its chords, SAMPLES per interval, scaled [m]."""
 
 
 def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:
@@ -37,7 +37,7 @@ def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, 
 
 
 def pieces_of(begin: int, end: int) -> Array:
-    """Steps that divide a motion into nearly straight pieces, until it rests; shape (n,)."""
+    """Steps that divide a motion into nearly straight pieces, up to its end; shape (n,)."""
     count = max(-(-(end - begin) * SAMPLES // SPACING), 1)
     return np.linspace(begin, begin + count * SPACING / SAMPLES, count + 1)
 
@@ -79,7 +79,7 @@ def last_step(motion: Motion) -> int:
 
 @part
 def bounding_box(motion: Motion, lands: bool, metric: MotionMetric, low: F1, high: F1) -> None:
-    """Fill in two corners of a box around a motion, and its landing if `lands`, scaled [m]."""
+    """Fill in the corners of a box around a motion, down to the ground if `lands`, scaled [m]."""
     position, velocity, scale = motion.position, motion.velocity, metric.scale
     for x in range(len(scale)):
         low[x], high[x], turn = np.inf, -np.inf, 0.0

@@ -28,10 +28,10 @@ from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 
 
 class HalfPlanes(NamedTuple):
-    """Constraints normal · p ≥ bound on positions p at some times."""
+    """Constraints normal · p ≥ bound on positions p, each at one of the sampled times."""
 
     time: I1
-    """Index into the sampled times; shape (n,)."""
+    """Index of each constraint's time in the sampled times; shape (n,)."""
     normal: F2
     """Unit vector away from the other vehicle; shape (n, axes)."""
     bound: F1
@@ -40,7 +40,7 @@ class HalfPlanes(NamedTuple):
     """Index of the motion to keep away from; shape (n,)."""
 
     def from_some(self, chosen: Flags) -> "HalfPlanes":
-        """Half-planes of the chosen motions only; `chosen` has shape (motions,)."""
+        """Half-planes of some motions; `chosen`: flags of these motions, shape (motions,)."""
         selected = chosen[self.other]
         return HalfPlanes._make(each[selected] for each in self)
 
@@ -57,18 +57,18 @@ def half_planes(
 ) -> HalfPlanes:
     """Half-planes normal to the lines from the others' motions to the motion in force.
 
-    If the step of another vehicle is not known exactly, the nearest of its possible positions is
-    used, and all of them lie behind the plane.
+    If the step of another vehicle is not known exactly, the line starts at its nearest possible
+    position, and all its possible positions lie behind the plane.
 
     Args:
         times: common steps; shape (n,).
         in_force: positions of the motion in force at these steps [m]; shape (n, axes).
         reach_m: largest distance of the plan from these positions [m]; shape (n,).
-        row: row of the vehicle, whose own motions are left out.
+        row: row of the vehicle; its own motions are ignored.
         lands: first step at which the vehicle may begin to land, or NEVER.
         possible: motions of all vehicles.
-        distance_m: distance to keep [m]; less if the motion in force is nearer already.
-        error: error of the vehicle's counted steps.
+        distance_m: distance to keep [m]; less if the motion in force is nearer already. error:
+        error of the vehicle's step number by the server's count.
     """
     capacity = len(times) * possible.count
     planes = HalfPlanes(
@@ -122,8 +122,8 @@ def _half_planes(
             away = _offset_from_way(
                 in_force[i], way[:corners], descends, other_descends, scale, off, scratch
             )
-            # No constraint if it cannot be active (out of reach) or has no direction (both vehicles
-            # at the same position).
+            # No constraint if the vehicles are out of reach of each other, or at the same position,
+            # so that the plane has no direction.
             if away >= keep + reach[i] or away == 0.0:
                 continue
             own = 0.0
@@ -142,7 +142,7 @@ def _half_planes(
 def _possible_way(
     other: Motion, step: float, least: float, most: float, dt_s: float, way: F2
 ) -> int:
-    """Fill in a polyline of another vehicle's possible positions [m]; returns its corner count."""
+    """Fill in a polyline of another vehicle's possible positions [m]; return its corner count."""
     first, last = moving_shifts(other, step, step, least, most)
     slices = int(np.ceil((last - first) * SAMPLES / SPACING))
     for j in range(slices + 1):

@@ -1,7 +1,7 @@
 """Led vehicles: vehicles of a mission that follow this server, with or without a standby server.
 
-A server plans motions only if all vehicles of the mission have sent it the same number of its
-leadership and were observed since (docs/together-proof.md, Two servers).
+A server plans motions only if all vehicles of the mission have sent it the same leadership number
+and were observed since then (docs/together-proof.md, Two servers).
 """
 
 from skytether.shared.law.model import Indices
@@ -11,15 +11,15 @@ from skytether.shared.wire.lead import Lead
 class LedVehicles:
     def __init__(self) -> None:
         self._numbers: dict[int, int | None] = {}
-        """Number of the leadership under which this server leads each row's vehicle; None if
-        another server leads it."""
+        """Leadership number with which each row's vehicle follows this server; None if the vehicle
+        follows another server."""
         self._alone: set[int] = set()
         """Rows of vehicles that have no other server."""
         self._awaited: dict[int, int] = {}
-        """Rows that this server has begun to lead and has not observed since, with the first step
-        of an observation under its lead."""
+        """Rows of vehicles that this server has begun to lead but has not observed since, with the
+        first step of observations that count."""
         self.missing: int | None = None
-        """Row of a vehicle that prevents all planning of motions; None if there is none."""
+        """Row of a vehicle because of which no motion may be planned; None if there is none."""
 
     def follow(self, row: int, lead: Lead | None) -> bool:
         """Note a vehicle's leader; return whether `lead` may contain a motion to take over."""
@@ -39,7 +39,7 @@ class LedVehicles:
 
     @property
     def is_standby(self) -> bool:
-        """Whether another server leads all vehicles from which packets have arrived."""
+        """Whether another server leads all vehicles that have sent packets to this server."""
         return bool(self._numbers) and set(self._numbers.values()) == {None}
 
     def awaits(self, row: int) -> bool:
@@ -59,6 +59,6 @@ class LedVehicles:
         missing = (
             row for row, number in self._numbers.items() if number != newest or row in self._awaited
         )
-        # If a vehicle has only this server, no other server receives packets of all vehicles or
-        # plans: the other vehicles fly this server's motions, or hold their positions.
+        # If a vehicle has only this server, no other server ever observes all vehicles, so none
+        # plans: all vehicles fly this server's motions, or hold their positions.
         self.missing = None if self._alone else next(missing, None)

@@ -1,14 +1,14 @@
 """Mission planner: motions that keep vehicles apart and out of zones, even if packets are lost.
 
 A motion gives the position of a vehicle at all times: a spline that ends at rest, and rest after
-that. It is sent as a trajectory with all its knots, so a vehicle that receives no further packet
-flies it to its end and hovers there. For each vehicle the server stores every motion that the
-vehicle may fly:
+that. A motion is sent as a trajectory with all its knots, so a vehicle that receives no further
+packet flies the motion to its end and hovers there. For each vehicle the server stores every motion
+that the vehicle may fly:
 
-- the motion in force at its newest observation, which acknowledges it; and
-- each motion sent since, as long as its packet may still be accepted. The vehicle accepts a
-  trajectory no later than `link.join_s` after its first knot, so a later observation shows reliably
-  whether the vehicle accepted it.
+- the motion in force, which the newest observation acknowledges; and - each motion sent since, as
+long as the vehicle may still accept its packet. The vehicle accepts a motion no later than
+`link.join_s` after its first knot, so a later observation shows reliably whether the vehicle has
+accepted the motion.
 
 A new motion is sent only if at all times it keeps the distance
 
@@ -16,14 +16,14 @@ A new motion is sent only if at all times it keeps the distance
 
 from all motions that all other vehicles may fly, at every position that the errors of their clocks
 allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); the others
-keep more distance from a vehicle observed outside its tube. The motions sent earlier were apart
-already. So for any set of accepted motions and of lost or late packets, vehicles are `separation_m`
-apart as long as each stays in its tube (docs/together-proof.md has the theorem). The distance from
-zones is `tube_m`. Staying on the motion in force is always possible: it needs no packet.
+keep more distance from a vehicle observed outside its tube. Motions sent earlier keep D already. So
+whichever packets are lost or late, and whichever motions are accepted, vehicles are `separation_m`
+apart if each stays in its tube (theorem: docs/together-proof.md). The distance from zones is
+`tube_m`. A vehicle can always stay on its motion in force: this needs no packet.
 
 `mission_state` has the motions that may be flown, `trajectory_qp` the QP, `separation` and
 `half_planes` the distances, `routes` the paths around zones, `waypoints` the next target of a
-vehicle, and `yielding` which vehicle makes way for another.
+vehicle, and `yielding` the choice of a vehicle that makes way for another.
 """
 
 import math
@@ -64,28 +64,28 @@ from skytether.shared.wire.protocol import KNOTS_MAX, Observation, RoomMessage
 RESTS_MPS = 0.2
 """Measured speed below which a vehicle counts as at rest [m/s]."""
 ARRIVED_M = 0.02
-"""Distance from the goal within which the end of a motion counts as at the goal [m]."""
+"""Distance from the goal up to which the end of a motion counts as at the goal [m]."""
 ROUNDS = 5
 """Largest number of QPs per waypoint, each with further constraints."""
 STUCK = 0.3
-"""Share of the distance to its waypoint (2 m at most) below which a plan counts as stuck."""
+"""Share of the distance to its waypoint (2 m at most) that a plan must cover; else it is stuck."""
 TURN = 2.0 * np.pi * np.arange(32) / 32
 AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 """Directions in which a vehicle at rest within a zone searches for a way out."""
 OUT_M, OUT_STEPS = 0.1, 500
 """Distance between candidate positions on the way out [m], and their number."""
 NEARER_M = 1e-3
-"""Distance by which a vehicle that leaves a zone may come nearer: a tolerance [m]."""
+"""Distance by which a vehicle that leaves a zone may approach it: a tolerance [m]."""
 ZONE = "a zone"
 CLOCK_POINTS = 33
-"""Number of possible steps of a vehicle that `clock_m` evaluates."""
+"""Number of possible steps of a vehicle at which `clock_m` is evaluated."""
 BINDS_M = 1e-4
 """Distance of a motion from a half-plane within which the half-plane counts as limiting it [m]."""
 
 ZONES, GOALS = keys_of(keys.ZONES), keys_of(keys.GOALS)
 
 SILENT = np.zeros((), dtype=FIGURES)
-"""Figures of a vehicle without a packet to send."""
+"""Figures of a vehicle to which no packet is sent."""
 SILENT["gap"], SILENT["solved"] = 1, True
 
 
@@ -150,7 +150,7 @@ class MissionPlanner(SplineScheme):
         foresight.estimate[:n] = foresight.start[:n] = self._state.state[rows]
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
-        """Plan for each vehicle every SPACING steps, for different vehicles at different steps."""
+        """Plan for each vehicle every SPACING steps; the vehicles take turns."""
         figures, n = self.figures, len(rows)
         self._state.align(rows, step)
         figures["expected_gap"][:n] = 0.0
@@ -171,7 +171,7 @@ class MissionPlanner(SplineScheme):
                 self._plan_to_goal(row, vehicle, k)
         for i in due:
             vehicle = self._state.vehicles[int(rows[i])]
-            # A figure above any threshold: every motion that was found has to be sent.
+            # A figure above any threshold, because every motion found has to be sent.
             if vehicle.next or vehicle.repeat:
                 figures["expected_gap"][i] = 1e9
             if vehicle.next:
@@ -217,7 +217,7 @@ class MissionPlanner(SplineScheme):
     def _objection(self, zones: Zones) -> str:
         """Reason why these zones are refused; empty if they are accepted.
 
-        A server that leads no vehicle accepts all; the leader, which has all motions, checks.
+        A server that leads no vehicle accepts all zones; the leader knows all motions, and checks.
         """
         if self.is_standby:
             return ""
@@ -230,8 +230,8 @@ class MissionPlanner(SplineScheme):
                 + max(vehicle.outside_m, self._state.brakes_m(vehicle))
             )
             for motion in vehicle.motions():
-                # Earliest possible step of the vehicle. Before its first knot a motion is at rest,
-                # so even with an unbounded clock error no earlier step is needed.
+                # k: earliest possible step of the vehicle. Before its first knot a motion is at
+                # rest, so no earlier step matters, even with an unbounded clock error.
                 late = max(self._state.error(row).late, 0.0)
                 step = self._state.now + self._state.ahead(row)
                 k = math.floor(max(step - late, motion.first))
@@ -264,7 +264,7 @@ class MissionPlanner(SplineScheme):
         return {name: value for name, value in figures.items() if value is not None}
 
     def _clock_m(self, row: int) -> float | None:
-        """Displacement of a vehicle along its motion by its clock error [m]; None if unknown.
+        """Largest distance of a vehicle along its motion by its clock error [m]; None if unknown.
 
         Other vehicles keep this additional distance along its path.
         """
@@ -280,16 +280,16 @@ class MissionPlanner(SplineScheme):
     # -- decisions ---------------------------------------------------------------------------------
 
     def _may_plan(self, row: int, vehicle: VehicleMotions, k: int) -> bool:
-        """Whether a motion may be planned at step k; otherwise sets `waits_for`, or repeats the
-        motion.
+        """Whether a motion may be planned at step k; if not, sets `waits_for`, or has the motion in
+        force sent again.
         """
         in_force = vehicle.in_force
         assert in_force is not None
         vehicle.waits_for = self._own_wait(row, vehicle)
         if vehicle.waits_for:
             return False
-        # A vehicle without a motion is first sent its hovering position as a motion. A motion too
-        # old to be flown would end aboard, and the vehicle would drift.
+        # A vehicle without a motion first gets its hovering position as a motion. The motion in
+        # force is sent again before it is too old to be flown, or the vehicle would drift.
         if in_force.step < 0 or k - in_force.step > self._resend_after:
             vehicle.next = in_force.motion
             return False
@@ -305,7 +305,7 @@ class MissionPlanner(SplineScheme):
         if self._state.led_vehicles.awaits(row):
             return "its first observation"
         if vehicle.sent:
-            return "an acknowledgement"  # the present motion is unknown
+            return "an acknowledgement"  # the motion in force is unknown
         has_motion = vehicle.in_force is not None and vehicle.in_force.step >= 0
         return "" if has_motion or vehicle.speed_mps <= RESTS_MPS else "coming to rest"
 
@@ -353,7 +353,7 @@ class MissionPlanner(SplineScheme):
             vehicle.zone_blocks = False
 
     def _way_out(self, row: int, vehicle: VehicleMotions, place: Array) -> Array | None:
-        """Nearest position clear of zones [m], for a vehicle that rests within a zone, or None.
+        """Nearest position clear of zones [m], if a vehicle rests within a zone; else None.
 
         No motion leads into a zone, so the vehicle has been there since the server started.
         """
@@ -389,7 +389,7 @@ class MissionPlanner(SplineScheme):
         return np.concatenate([place[None], self._waypoints.routes.way(place, goal)])
 
     def _has_to_pass(self, yields: Yielding, home: Array) -> bool:
-        """Whether the asking vehicle has not yet passed the goal of the yielding vehicle."""
+        """Whether the vehicle that asked still has to pass the goal of the yielding vehicle."""
         path = self._way(yields.asker, self._state.goal(yields.asker)) * self._scale
         (away_m,) = yielding.distance_from_way(home[None] * self._scale, path)
         return bool(away_m < self._clearances.planned_apart_m)
@@ -431,11 +431,11 @@ class MissionPlanner(SplineScheme):
     def _motion_toward(
         self, row: int, vehicle: VehicleMotions, k: int, goal: Array, path: Array | None
     ) -> Motion | None:
-        """Motion that continues the motion in force along a path, or, if the path is blocked,
-        towards a goal; None if none is found.
+        """New motion, which continues the motion in force along a path, or towards a goal if there
+        is no free path; None if no motion is found.
 
-        The result is added to the possible motions, so that the next vehicle's plan accounts for
-        it. Constraints are added once a solution violates them: usually the path is free and
+        The new motion is added to the possible motions, so that the next vehicle's plan accounts
+        for it. Constraints are added only after a solution violates them: most paths are free and
         straight.
         """
         assert vehicle.in_force is not None
@@ -492,7 +492,7 @@ class MissionPlanner(SplineScheme):
         if not self._zones:
             return planes
         near = self._zones.planes(in_force, qp.reach_m + self._clearances.planned_clear_m)
-        # A vehicle already too near to a zone is only forbidden to come nearer.
+        # A vehicle that is too near to a zone already may stay, but not come nearer.
         bound = np.minimum(self._clearances.planned_clear_m, near.away_m - 1e-4)
         bound += np.einsum("ij,ij->i", near.normal, near.border)
         return HalfPlanes(
@@ -516,8 +516,8 @@ class MissionPlanner(SplineScheme):
         return f"vehicle {self._state.number_of(int(self._state.possible.rows[most]))}"
 
     def _conflicts(self, row: int, motion: Motion, planned: PossibleMotion) -> Flags:
-        """Flags of the motions that are too near; the last flag is for zones. `planned`: motion in
-        common steps.
+        """Flags of the motions that `motion` comes too near to; the last flag is for zones.
+        `planned`: the same motion in common steps.
         """
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None
@@ -535,8 +535,8 @@ class MissionPlanner(SplineScheme):
         return conflicts
 
     def _enters_zone(self, points: Array) -> bool:
-        """Whether a polyline comes too near to a zone, unless it leads away from a zone at its
-        start.
+        """Whether a polyline comes too near to a zone, except to a zone at its start that it leads
+        away from.
         """
         clearance_m = self._clearances.tube_m + self._clearances.bend_m
         if not comes_near(self._zones, points, clearance_m):

@@ -1,8 +1,8 @@
 """Mission state: the motions that each vehicle may fly, as far as the server knows.
 
-Observations, which acknowledge motions, and the motions sent update it; `mission_planner` plans
-with it. The steps of all vehicles are mapped to one common grid here, so that motions can be
-compared.
+Observations, which acknowledge motions, and each motion sent update this state; `mission_planner`
+plans with it. Here the steps of all vehicles are mapped to one common time grid, so that motions
+can be compared.
 """
 
 from collections import Counter
@@ -36,30 +36,30 @@ RESTART_STEPS = 20
 PLANNED = np.arange(1.0, INTERVALS + 1.0)
 """Numbers n of a motion's planned knots."""
 PLAN_DUE, REPEAT_DUE = 1, 2
-"""Flags in `MissionState.due`: at this step, a motion may be planned for the vehicle; the vehicle's
-latest motion is sent again."""
+"""Flags in `MissionState.due`: at this step a motion may be planned for the vehicle; or its latest
+motion is sent again."""
 
 
 class VehicleRows(NamedTuple):
     """Data of all rows; each of shape (capacity,)."""
 
     ahead: I1
-    """Steps by which the vehicle is ahead of the common grid."""
+    """Step of the vehicle by the server's count, minus the step of the common time grid."""
     aligned: B1
     heard: B1
     """Whether an observation has arrived in this session."""
     number: I1
-    """Number of the vehicle last observed in the row."""
+    """Number of the vehicle that was last observed in the row."""
     observed_step: I1
     """Step of the vehicle's newest observation; -1 before the first."""
     lands: I1
     """First step at which the vehicle may begin to land, or NEVER."""
     unknown_until: I1
-    """Last step at which the vehicle may fly a motion sent by another server."""
+    """Last step at which the vehicle may fly a motion of another server; -1 if none."""
     sent_step: I1
-    """Step of the latest motion sent and not acknowledged; 0 if there is none."""
+    """Step of the latest motion sent if it is not acknowledged; 0 if there is none."""
     repeats_for: I1
-    """Steps after `sent_step` for which the motion is repeated, see `VehicleMotions.repeats`."""
+    """Number of steps for which the latest motion is repeated, see `VehicleMotions.repeats`."""
     early: F1
     """Largest number of steps that the vehicle may be ahead of `now + ahead`, see `StepError`."""
     late: F1
@@ -77,8 +77,8 @@ class VehicleRows(NamedTuple):
 
 
 class MissionState:
-    """Vehicles of a mission, the motions that each may fly, and their offsets on a common grid of
-    steps.
+    """Vehicles of a mission, the motions that each may fly, and the offset of each vehicle's steps
+    from a common time grid.
 
     Args:
         block: largest number of vehicles in one call of `align`.
@@ -99,7 +99,7 @@ class MissionState:
         self._clock, self._dt_ns = clock, terms.dt_ns
         self.counts: Counter[str] = Counter()
         self.events: list[Event] = []
-        """Events for the operator; the caller empties the list."""
+        """Events for the operator, which the caller removes."""
         self.margins = {"tube": 0.0, "join": 0.0}
         """Largest distance of a vehicle from its motion, and largest time after a motion's first
         knot at which it was accepted, each as a share of the value that the theorem assumes."""
@@ -122,7 +122,7 @@ class MissionState:
         self.kept_steps = -(-terms.join // SPACING) * SPACING
         """Number of steps from the first knot for which a new motion equals the one in force."""
         self._land_after = terms.land_after if lands(scenario) else NEVER
-        """Steps of hovering without packets after which a vehicle lands."""
+        """Number of steps without packets after which a hovering vehicle lands."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
         """Time constant [s] and deceleration [m/s²] of braking without a motion."""
         self.now = 0
@@ -140,10 +140,10 @@ class MissionState:
         self._is_updated = False
         """Whether `possible` has been updated for the present step."""
         self._changed: set[int] = set()
-        """Rows whose motions, extra distance or offset on the grid have changed since the last
-        `update_possible`."""
+        """Rows whose motions, extra distance or offset from the time grid have changed since the
+        last `update_possible`."""
         self.decided: set[int] = set()
-        """Rows of the vehicles with a motion to be sent at their newest step."""
+        """Rows of the vehicles to which a new motion is to be sent at their newest step."""
         self.restarted: dict[int, int] = {}
         """Step of a client's restart without saved state, by row. The vehicle may be anywhere on
         its motions until it is observed after the restart."""
@@ -160,7 +160,7 @@ class MissionState:
             self.vehicles[row].goal = None
 
     def restart(self, row: int) -> bool:
-        """Note that a vehicle's client has restarted; False if this was noted before."""
+        """Note that a vehicle's client has restarted; return False if it was noted before."""
         vehicle = self.vehicles.get(row)
         if vehicle is None or row in self.restarted:
             return False
@@ -172,8 +172,8 @@ class MissionState:
     def follow(self, row: int, lead: Lead | None) -> None:
         """Note which server leads a vehicle.
 
-        If this server begins to lead the vehicle, `lead` contains its motion in force. The vehicle
-        drops all plans of an earlier leadership, so no other motion needs to be expected.
+        If this server begins to lead the vehicle, `lead` contains the motion in force. The vehicle
+        drops plans with earlier leadership numbers, so it can fly no other motion.
         """
         if self.led_vehicles.follow(row, lead):
             assert lead is not None
@@ -184,7 +184,7 @@ class MissionState:
         self.rows.number[row] = self.number_of(row)
         vehicle.sent.clear()
         vehicle.next = None
-        self.observed_step[row] = lead.step - 1  # older observations show an earlier motion
+        self.observed_step[row] = lead.step - 1  # older observations may show an older motion
         knots = np.asarray(lead.knots, dtype=np.float64)
         if lead.in_force is not None and lead.spacing == SPACING and knots.size:
             position, velocity = np.ascontiguousarray(knots.transpose(2, 1, 0))
@@ -235,7 +235,7 @@ class MissionState:
     def unknown(self) -> int | None:
         """Number of a vehicle whose possible positions are unknown; None if there is none.
 
-        A restarted server has not observed the vehicle, or it flies an earlier server's motion.
+        Either a restarted server has not observed it, or it flies a motion of another server.
         """
         unheard = self.absent.difference(self.rows.number[list(self.vehicles)].tolist())
         if unheard:
@@ -260,11 +260,10 @@ class MissionState:
         self.rows.number[row] = self.number_of(row)
         self._watch(row, vehicle, observation)
         if observation.in_force == NO_HORIZON:
-            # The vehicle hovers or comes to rest where it is: no motion was accepted, or all have
-            # ended.
+            # The vehicle hovers, or brakes to hover: it has accepted no motion, or has ended all.
             vehicle.in_force = SentMotion(-1, resting(k, self._place(row, observation.state[:, 0])))
             vehicle.is_foreign = False
-            # Motions of an earlier session will not be accepted either.
+            # The vehicle will not accept motions of an earlier session, either.
             if not observation.takes or not self.rows.heard[row]:
                 vehicle.sent.clear()
         elif vehicle.in_force is None or vehicle.in_force.step != observation.in_force:
@@ -281,8 +280,8 @@ class MissionState:
         if flies_on:
             self.foreign = row
         if flies_on or vehicle.is_foreign:
-            # Also once after the end of the foreign motion: the vehicle then rests at that end,
-            # not at a position observed earlier.
+            # Also once after the end of another server's motion: the vehicle then rests at that
+            # end, not at a position observed earlier.
             vehicle.in_force = SentMotion(
                 vehicle.in_force.step, resting(k, observation.state[:, 0])
             )
@@ -328,7 +327,7 @@ class MissionState:
         if self._land_after == NEVER:
             return
         match observation.mode:
-            # The first observation may be from another run of the client, whose steps differ.
+            # Not at the first observation: before it the client may have counted other steps.
             case Mode.HOVER if lands[row] < NEVER and self.rows.heard[row]:
                 # The vehicle may land from now on, but not before the step computed earlier.
                 lands[row] = max(lands[row], k)
@@ -338,7 +337,7 @@ class MissionState:
                 lands[row] = k + self._land_after
 
     def _measure(self, row: int, vehicle: VehicleMotions, expected: Array) -> None:
-        """Update the distance of a vehicle from its tube, and its speed."""
+        """Update the distance of a vehicle outside its tube, and its speed."""
         number, state = self.number_of(row), self.state[row]
         assert vehicle.in_force is not None
         outside_m = float(np.linalg.norm(expected - state[:, 0])) - self._tube_m
@@ -359,7 +358,7 @@ class MissionState:
         return vehicle.speed_mps * (self._tau_s + vehicle.speed_mps / self._braking)
 
     def _place(self, row: int, observed: Array) -> Array:
-        """Resting position of a vehicle without a motion: its start if near, else as observed."""
+        """Resting position of a vehicle without a motion: its start if near, else `observed`."""
         number = self.number_of(row)
         if number not in self.absent:
             return observed
@@ -375,7 +374,7 @@ class MissionState:
         counted = self.now + self.rows.ahead
         self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
         for row, since in self.restarted.items():
-            # The vehicle may have stopped anywhere on its motion.
+            # With a restarted client the vehicle may have stopped anywhere on its motion.
             stands = float(LONGEST + counted[row] - since)
             self.rows.late[row] = max(self.rows.late[row], stands)
         if moved:
@@ -394,15 +393,15 @@ class MissionState:
         self._is_updated = True
         for row in self._changed & self.vehicles.keys():
             vehicle = self.vehicles[row]
-            # This includes motions whose acknowledgement is still in flight.
+            # Unacknowledged motions are included.
             motions = [self.possible_motion(row, motion) for motion in vehicle.motions()]
             self.possible.replace(row, motions, vehicle.outside_m)
         self._changed.clear()
         self.possible.set_errors(self.rows.early, self.rows.late)
 
     def goal(self, row: int) -> Array:
-        """Present goal of a vehicle [m]; shape (axes,). In a show: the point of its path at the end
-        of a motion planned now.
+        """Present goal of a vehicle [m]; shape (axes,). In a show, the point of the vehicle's path
+        at the end time of a motion planned now.
         """
         steps = self.kept_steps + INTERVALS * SPACING if self.is_show else 0
         return self._desired(row, np.array((self.now + self.ahead(row) + steps) * self._dt_s))
@@ -410,7 +409,7 @@ class MissionState:
     def targets(self, row: int) -> Array:
         """Points of a show's path for the planned knots of a motion [m]; shape (N, axes).
 
-        A vehicle lags its motion by its dead time, so the motion is that much ahead of the path.
+        A vehicle lags its motion by its dead time, so the motion leads the path by this time.
         """
         steps = self.now + self.ahead(row) + self.kept_steps + SPACING * PLANNED
         places = [self._desired(row, steps * self._dt_s + dead_s) for dead_s in self._dead_time_s]
@@ -434,16 +433,16 @@ class MissionState:
 def _align(
     rows: I1, step: I1, now: int, vehicles: VehicleRows, due: I1, moved_by: I1
 ) -> tuple[int, int]:
-    """Map vehicles to the common grid, and set PLAN_DUE and REPEAT_DUE for each.
+    """Map vehicles to the common time grid, and set PLAN_DUE and REPEAT_DUE for each.
 
     Args:
         now: present step on the grid.
         due: output: PLAN_DUE, REPEAT_DUE, both or 0; shape (n,) at least.
-        moved_by: output: change of the offset on the grid [steps]; shape (n,) at least.
+        moved_by: output: change of the offset from the grid [steps]; shape (n,) at least.
 
     Returns:
-        number of vehicles with another offset on the grid, and a row that may still fly a motion of
-        another server, or -1.
+        number of vehicles whose offset has changed, and the row of a vehicle that may still fly a
+        motion of another server, or -1.
     """
     moved, foreign = 0, -1
     for i in range(len(rows)):

@@ -16,11 +16,11 @@ from skytether.shared.scenario.schema import Scenario
 def references(
     scenario: Scenario, given: Callable[[int], Reference] | None, most: int
 ) -> Callable[[int], Reference]:
-    """References of vehicles by number, with goals that may be replaced in flight.
+    """References of vehicles, by number, whose goals may be replaced in flight.
 
     Args:
         given: references without these goals; None: the scenario's.
-        most: number of vehicles at most.
+        most: largest number of vehicles.
     """
     goals = parse_goals(scenario.section(MissionConfig).goals, scenario.model.axes)
     return Guided(given or scenario.measured_reference, goals, most)

@@ -1,13 +1,13 @@
 """Possible motions of all vehicles in arrays, with their uncertainty.
 
-The server knows the position of each vehicle on its motion up to the error of the step that it
-counts (`planning.clock.StepError`). Between two vehicles only the sum of both errors matters: the
-number of steps by which the second vehicle may be ahead or behind. So the first vehicle is assumed
-at its counted step, and the second anywhere between two steps: on a piece of its path whose length
-grows with speed, a point at rest.
+The server knows the position of each vehicle on its motion up to the error of the vehicle's step
+number by the server's count (`planning.clock.StepError`). For two vehicles only the sum of both
+errors matters: the number of steps by which the second may be ahead or behind. So the first vehicle
+is assumed to be at its step by the server's count, and the second anywhere between two steps: on a
+piece of its path that is longer at a higher speed, and a point at rest.
 
 In three dimensions a vehicle without contact lands after a while. From the first possible step of
-the landing on, it may be anywhere between its motion, at rest by then, and the ground. So in the
+the landing on, the vehicle may be anywhere between the end of its motion and the ground. So in the
 end any two motions have to be apart horizontally.
 """
 
@@ -36,7 +36,7 @@ class PossibleMotion(NamedTuple):
 
 
 class MotionArrays(NamedTuple):
-    """Possible motions in arrays; shapes (capacity, …)."""
+    """Possible motions as arrays with a row for each motion; shapes (capacity, …)."""
 
     first: I1
     knots: I1
@@ -75,7 +75,7 @@ class PossibleMotions:
             self.add(row, motion, extra_m)
 
     def add(self, row: int, motion: PossibleMotion, extra_m: float = 0.0) -> None:
-        """Add a motion; the distance to keep from it is larger by `extra_m` [m]."""
+        """Add a motion, from which others keep a distance larger by `extra_m` [m]."""
         if self.count == len(self.arrays.row):
             self.arrays = MotionArrays._make(
                 np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
@@ -139,7 +139,7 @@ def _add(
 
 @making_kernel
 def _remove(arrays: MotionArrays, count: int, row: int, metric: MotionMetric) -> int:
-    """Remove a vehicle's motions, and fill the gaps with the last ones; return the number left."""
+    """Remove a vehicle's motions, move the last motions into the gaps, return the number left."""
     for m in range(count - 1, -1, -1):
         if arrays.row[m] == row:
             count -= 1
@@ -174,12 +174,12 @@ def height_above(height: float, one_lands: bool, other_lands: bool) -> float:
 
 @part
 def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float]:
-    """Bounds of the steps by which another vehicle may be ahead, relative to the first vehicle's
-    counted step.
+    """Least and largest number of steps by which another vehicle may be ahead of the first, with
+    the first at its step by the server's count.
 
     Args:
         one, other: errors of the steps of both vehicles.
-        drift: added for the drift of the clocks over the time looked ahead [steps].
+        drift: drift of the clocks up to the end of the comparison [steps].
     """
     return -other.late - one.early - drift, other.early + one.late + drift
 
@@ -188,7 +188,7 @@ def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float
 def moving_shifts(
     other: Motion, begin: float, end: float, least: float, most: float
 ) -> tuple[float, float]:
-    """Part of the shifts from `least` to `most` that changes the position on another motion.
+    """Part of the shifts from `least` to `most` in which another motion is not at rest.
 
     Args:
         begin, end: steps between which the motion is evaluated.

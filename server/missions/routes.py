@@ -1,6 +1,6 @@
 """Routes around zones: the shortest polyline from a position to a goal, at a distance from zones.
 
-The nodes of a visibility graph lie off the corners of zones; two nodes are joined if the straight
+The nodes of a visibility graph lie near the corners of zones; two nodes are joined if the straight
 line between them is clear. Shortest paths between all nodes are computed once (Floyd and Warshall).
 Paths are horizontal: zones entirely above or below both position and goal are ignored.
 """
@@ -14,11 +14,11 @@ from skytether.shared.law.model import Array, Flags
 from skytether.shared.missions.zones import Zones
 
 NODES_MAX = 200
-"""Largest number of nodes; with more, corners of the last zones are left out."""
+"""Largest number of nodes; further nodes, at corners of the last zones, are ignored."""
 OFF_M = 0.1
 """Distance of nodes from corners in addition to the clearance [m]."""
 GRAPHS_MAX = 64
-"""Largest number of cached graphs, one for each choice of zones by height."""
+"""Largest number of cached graphs, one for each set of zones that matter at a height."""
 TINY_M = 1e-6
 """Rounding tolerance [m]."""
 
@@ -31,8 +31,8 @@ class RoutesAroundZones:
         self._graph = lru_cache(GRAPHS_MAX)(self._make)
 
     def way(self, place: Array, goal: Array) -> Array:
-        """Corners of the shortest route and the goal; only the goal if there is no route; shape (n,
-        axes).
+        """Corners of the shortest route, and then the goal [m]; only the goal if there is no route;
+        shape (n, axes).
         """
         if not self._zones:
             return goal[None]
@@ -89,8 +89,8 @@ class Graph:
             far = np.where(longer, far[:, [via]] + far[[via]], far)
             after = np.where(longer, after[:, [via]], after)
         self._far, self._after = far, after
-        """Length of the shortest path between two nodes [m], infinite without one, and its next
-        node."""
+        """Length of the shortest path from one node to another [m], infinite without a path, and
+        the next node on it."""
 
     def corners(self, place: Array, goal: Array) -> Array:
         """Corners of the shortest path between two positions; empty if straight or absent."""
@@ -107,7 +107,7 @@ class Graph:
         return nodes[path]
 
     def sees(self, starts: Array, ends: Array) -> Flags:
-        """Whether straight lines keep their clearance; shape (n,), for points of shape (n, 2)."""
+        """Whether straight lines keep the clearance; shape (n,); starts and ends: shape (n, 2)."""
         return are_clear(self._zones, starts, ends, self._clearance_m - TINY_M)
 
     def _lengths(self, start: Array) -> Array:
@@ -118,7 +118,7 @@ class Graph:
 
 
 def _nodes(zones: Zones, off_m: float) -> Array:
-    """Positions off the corners of zones, on both sides along the bisector [m]; shape (n, 2)."""
+    """Positions near the corners of zones, at `off_m` on both sides [m]; shape (n, 2)."""
     points = [np.zeros((0, 2))]
     for zone in zones.zones:
         corners = zone.corners

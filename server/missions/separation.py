@@ -29,9 +29,9 @@ from skytether.shared.law.model import ALTITUDE, Flags
 from skytether.shared.law.motion import SAMPLES, SPACING, Motion
 
 NEARER_M = 1e-3
-"""Distance by which motions that are already too near may approach: solver tolerance [m]."""
+"""Distance by which motions that are already too near may approach: the solver's tolerance [m]."""
 PIECES_MAX = 10_000
-"""Largest number of pieces sampled for a pair of motions; usually hundreds are needed."""
+"""Largest number of pieces sampled for a pair of motions; hundreds are usual."""
 
 
 class Pair(NamedTuple):
@@ -45,7 +45,7 @@ class Span(NamedTuple):
 
     begin: float
     end: float
-    """Last step; equal to the first if the first motion rests."""
+    """Last step; equal to `begin` if the first motion rests."""
     least: float
     """Least number of steps by which the other vehicle may be ahead."""
     most: float
@@ -67,11 +67,10 @@ def too_near(
     (possible.count + 1,), with False in the last, which is for zones.
 
     Args:
-        in_force: motion in force of the same vehicle. If it is too near already (not only by the
-            error of straight pieces), the planned motion may be nearer by NEARER_M at most: the
+        in_force: motion in force of the same vehicle. If it is too near already (by more than the
+            error of straight pieces), the planned motion may be nearer by NEARER_M at most: so the
             vehicle can always fly away.
-        begin: first step that counts.
-        row: row of the vehicle, whose own motions are left out.
+        begin: first step to compare. row: row of the vehicle; its own motions are ignored.
         distance_m: distance to keep from the possible motions [m].
     """
     is_near = np.zeros(possible.count + 1, dtype=np.bool_)
@@ -124,9 +123,9 @@ def comes_too_near(
     least = _least_distance(Pair(planned, other, metric), begin, keep, sides)
     if least >= keep:
         return False
-    # The bounds of both motions are compared; otherwise each plan could come nearer by the error of
-    # the pieces. If a vehicle may land, the error of a bound may exceed the curvature, so a motion
-    # that only seems too near has to keep the distance.
+    # Lower bounds of both motions are compared; otherwise each plan could come nearer by the error
+    # of the pieces. If a vehicle may land, a bound may be wrong by more than the curvature; so the
+    # planned motion has to keep the distance if the motion in force only seems too near.
     before = Pair(PossibleMotion(in_force, planned.lands, planned.error), other, metric)
     if least < _least_distance(before, begin, keep, sides) - NEARER_M:
         return True
@@ -158,8 +157,8 @@ def _least_distance(pair: Pair, begin: int, limit: float, sides: F2) -> float:
             nearest = min(nearest, within)
             i += 1
             continue
-        # Per piece, the midpoints approach by at most the distance flown by both vehicles, and
-        # `swept` grows by at most a piece: in total less than twice this distance.
+        # Per piece, the midpoints approach by at most the distance that both vehicles fly, and
+        # `swept` grows by at most a piece: together less than twice this distance.
         skipped = int(spare / (2.0 * fastest)) if fastest > 0.0 else pieces
         i = max(i + 1, min(i + skipped, pieces))
     return max(nearest, 0.0)
@@ -176,7 +175,7 @@ def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
     piece = SPACING / SAMPLES
     # At the last step both vehicles rest, after all possible landings.
     last = max(last_step(one.motion), last_step(other.motion) - least)
-    # Any subset of steps gives an upper bound: with an unbounded clock error not all are evaluated.
+    # Any subset of steps gives an upper bound, so with an unbounded clock error some are skipped.
     pieces = int(np.ceil(min(max((last - begin) / piece, 0.0), PIECES_MAX))) + 1
     nearest = limit
     for i in range(pieces + 1):
@@ -200,7 +199,7 @@ def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
 
 @part
 def _difference(pair: Pair, step: float, shift: float, x: int) -> float:
-    """Scaled difference of two motions on an axis, the other motion `shift` steps ahead [m]."""
+    """Scaled difference of two motions on an axis [m]; the other one is `shift` steps ahead."""
     dt_s = pair.metric.dt_s
     position = position_at(pair.one.motion, x, step, dt_s)
     return pair.metric.scale[x] * (position - position_at(pair.other.motion, x, step + shift, dt_s))
@@ -226,7 +225,7 @@ def _span(pair: Pair, begin: int, i: int, pieces: int, least: float, most: float
 
 @part
 def _distance_of_middles(pair: Pair, span: Span, lands: bool) -> float:
-    """Distance of the midpoints of two motions [m]; heights do not count if a vehicle `lands`."""
+    """Distance of two motions at the middle of a time interval [m]; without heights if `lands`."""
     square = 0.0
     middle, shift = 0.5 * (span.begin + span.end), 0.5 * (span.least + span.most)
     for x in range(len(pair.metric.scale)):
@@ -258,8 +257,7 @@ def _least_distance_within(
                 p01 = _difference(pair, span.begin, next_shift, x)
                 p11 = _difference(pair, span.end, next_shift, x)
             if x == ALTITUDE:
-                # A vehicle that may pass the other's height in this interval may do so anywhere in
-                # it.
+                # A vehicle that may pass the other's height does so anywhere in this interval.
                 high, low = max(p00, p10, p01, p11), min(p00, p10, p01, p11)
                 if (span.descends and high > 0.0) or (span.other_descends and low < 0.0):
                     p00, p10, p01, p11 = 0.0, 0.0, 0.0, 0.0

@@ -1,18 +1,18 @@
 """Trajectory QP: the QP for one motion of a vehicle that keeps away from others.
 
-The beginning of the motion equals the motion in force. After that it is planned over the
-accelerations a_n between knots T apart, for n = 0 … N-1,
+The beginning of the motion equals the motion in force. The rest is planned over the accelerations
+a_n between knots T apart, for n = 0 … N-1,
 
     min  Σ w_n |p_n - g_n|² + r Σ |a_n|²     v_N = 0,  |v_n + τ a_n| ≤ u,  |a_n| ≤ a_max
 
-with the targets g_n, equal for all n if the target is a waypoint, and a half-plane for each near
-motion and zone and each time,
+with the targets g_n (equal for all n if the target is a waypoint), and with a half-plane for each
+time and each near motion or zone,
 
     n(t) · (p(t) - q(t)) ≥ D     n(t) = (p̃(t) - q(t)) / |p̃(t) - q(t)|
 
 where q is the near motion, or the zone's nearest point, and p̃ the motion in force. The motion in
 force fulfils all constraints, so there is always a solution. DAQP, a dual active-set method, finds
-it: its cost depends on the number of active constraints only.
+the solution in a time that depends on the number of active constraints only.
 """
 
 from typing import NamedTuple
@@ -31,7 +31,7 @@ TIMES_PER_INTERVAL = 2
 ACCELERATION_WEIGHT = 0.05
 """Weight r of accelerations [s⁴]."""
 LAST_WEIGHT = 5.0
-"""Weight w_N of the last position; the others are 1."""
+"""Weight w_N of the last position; the weights of all other positions are 1."""
 VIOLATED = 1e-9
 """Tolerance above which a constraint counts as violated."""
 EQUALITY, SOLVED = 5, 1
@@ -39,7 +39,7 @@ EQUALITY, SOLVED = 5, 1
 
 
 class MotionProblem(NamedTuple):
-    """QP over the accelerations x of all axes, the first axis first: n = axes N numbers.
+    """QP over x, the N accelerations of the first axis, then those of the other axes.
 
     min  ½ xᵀ H x + fᵀ x     lower ≤ (x, A x) ≤ upper
     """
@@ -47,7 +47,7 @@ class MotionProblem(NamedTuple):
     H: Array
     f: Array
     A: Array
-    """Rows: rest at the end, inputs at the ends and the beginnings of intervals, half-planes."""
+    """Rows: rest at the end, inputs at ends and at beginnings of intervals, half-planes."""
     upper: Array
     lower: Array
     sense: NDArray[np.int32]
@@ -59,7 +59,7 @@ class TrajectoryQP:
 
     Args:
         acceleration_mps2: largest acceleration on an axis, a_max [m/s²].
-        speed_mps: largest speed over all axes [m/s]; 0: limited by the input bound only.
+        speed_mps: largest speed, of all axes together [m/s]; 0: only inputs are bounded.
     """
 
     def __init__(self, terms: Terms, acceleration_mps2: float, speed_mps: float) -> None:
@@ -72,14 +72,14 @@ class TrajectoryQP:
         self._until_knot_s = T * np.arange(1.0, n + 1.0)[:, None]
         to_position = _positions(np.arange(1.0, n + 1.0), place, T)
         self.times: Array = np.arange(n * TIMES_PER_INTERVAL + 1) / TIMES_PER_INTERVAL
-        """Times at which distances are kept, from the beginning of the plan [intervals]."""
+        """Times at which distances are kept, from the planned part's beginning [intervals]."""
         self._after_s = self.times[:, None] * T
         self._to_sample = _positions(self.times, place, T)
         """Matrix from accelerations to positions at `times` [s²]; shape (times, N)."""
         weights = np.ones(n)
         weights[-1] = LAST_WEIGHT
         self._to_gradient = to_position.T * weights
-        """Matrix from the distances to the targets to the QP's linear term [s²]; shape (N, N)."""
+        """Matrix from offsets from the targets to the QP's linear term [s²]; shape (N, N)."""
         one = self._to_gradient @ to_position
         hessian = np.kron(np.eye(axes), one + ACCELERATION_WEIGHT * np.eye(n))
         self._hessian = hessian.astype(np.float64)
@@ -90,17 +90,17 @@ class TrajectoryQP:
         before = np.kron(np.eye(axes), T * np.tril(np.ones((n, n)), -1))
         lag = np.diag(np.repeat(tau_s, n))
         self._rows = np.vstack([to_velocity[n - 1 :: n], to_velocity + lag, before + lag])
-        """Constraints that are always present; shape (axes + 2 axes N, axes N)."""
+        """Matrix A without half-planes; shape (axes + 2 axes N, axes N)."""
         moves = np.kron(np.eye(axes), np.ones((n, 1)))
         self._to_bounds = -np.vstack([0.0 * moves, np.eye(axes), moves, moves])
-        """Shift of the bounds per initial velocity; shape (axes + 3 axes N, axes)."""
+        """Change of the bounds per initial velocity; shape (axes + 3 axes N, axes)."""
         a_max, u = np.full(n * axes, acceleration_mps2), np.repeat(most, n)
         self._upper = np.concatenate([a_max, np.zeros(axes), u, u])
         self._sense = np.where(self._upper == 0.0, EQUALITY, 0).astype(np.int32)
         passed_s = self.times * T
         along_m = np.minimum(acceleration_mps2 * passed_s**2, 2.0 * most.max() * passed_s)
         self.reach_m = np.sqrt(axes) * along_m
-        """Largest distance at `times` between two motions from the same state [m]."""
+        """Largest distance at `times` between two motions that start in the same state [m]."""
 
     def solve(
         self, kept_p: Array, kept_v: Array, targets: Array, planes: HalfPlanes | None = None
@@ -119,10 +119,9 @@ class TrajectoryQP:
         if result != SOLVED:
             return None
         velocity = np.concatenate([kept_v, kept_v[-1] + self._to_velocity @ x.reshape(axes, -1).T])
-        # The last velocity is 0 only within the solver's tolerance, but a motion has to end at
-        # rest.
+        # A motion has to end at rest; in the solution it does so only within a tolerance.
         velocity[-1] = 0.0
-        # Positions are computed from these velocities, so that both agree exactly.
+        # Positions are computed from the velocities, so that both agree exactly.
         twice = velocity[kept:] + velocity[kept - 1 : -1]
         position = np.concatenate([kept_p, kept_p[-1] + self._to_velocity @ (0.5 * twice)])
         return position, velocity

@@ -1,8 +1,8 @@
 """Motions that one vehicle on a mission may fly, as far as the server knows.
 
 A motion that is not acknowledged is repeated unchanged while it may still be accepted. If a motion
-or its acknowledgement is lost, no motion can be planned until a later observation; so after such a
-loss the next motions are sent twice, and then three times.
+or its acknowledgement is lost, no motion can be planned until a later observation. So after such a
+loss the next motions are sent twice, and after another loss three times.
 """
 
 import math
@@ -18,13 +18,13 @@ from skytether.shared.law.motion import Motion
 COPIES_MAX = 3
 COPY_STEPS = 4
 PATIENCE_STEPS = 120
-"""Number of steps without progress towards its goal after which a vehicle asks another to yield."""
+"""Number of steps without progress to its goal after which a vehicle asks another to yield."""
 CLOSED_MAX = 8
 """Largest number of closed positions, see `VehicleMotions.closed`."""
 NEARER_M = 0.3
 """Reduction of the remaining path that counts as progress [m]."""
 PROMPT_COUNT = 8
-"""Number of successive, promptly acknowledged motions after which motions are sent less often."""
+"""Number of successive motions acknowledged promptly after which motions are sent less often."""
 
 
 class SentMotion(NamedTuple):
@@ -38,25 +38,25 @@ class VehicleMotions:
         self.in_force: SentMotion | None = None
         """Motion that the vehicle flies; None before the first observation."""
         self.is_foreign = False
-        """Whether `in_force` replaces a motion of another server: the vehicle rests where it was
-        last observed, or is still flying."""
+        """Whether `in_force` stands for an unknown motion of another server; it is then at rest
+        where the vehicle was last observed."""
         self.sent: deque[SentMotion] = deque(maxlen=64)
-        """Motions sent after the motion in force, oldest first, that may still be accepted."""
+        """Motions sent after the motion in force that may still be accepted, oldest first."""
         self.next: Motion | None = None
         self.turned_rad = 0.0
-        """Angle by which waypoints are turned to the right of the goal [rad]."""
+        """Angle to the right of the route at which waypoints are tried [rad]."""
         self.outside_m = 0.0
         """Distance of the vehicle outside its tube in the newest observation [m]."""
         self.speed_mps = 0.0
         self.detour: RoutesAroundZones | None = None
-        """Routes around resting vehicles where the vehicle was stuck; None if it never was."""
+        """Routes that also avoid resting vehicles; None before the vehicle was stuck."""
         self.detour_until = 0
         """Step until which `detour` is used."""
         self.closed: deque[Array] = deque(maxlen=CLOSED_MAX)
-        """Places between zones that are too narrow for a motion; routes avoid them [m]."""
+        """Positions in gaps too narrow for a motion, which routes avoid [m]."""
         self.goal: Array | None = None
-        """Goal to which progress is measured [m]; shape (axes,). None before the first goal, and
-        after the zones or the client's steps have changed."""
+        """Goal towards which progress is measured [m]; shape (axes,). None before the first goal,
+        and after a change of zones or of the numbering of the client's steps."""
         self.remaining_m = 0.0
         """Shortest remaining path to `goal` so far [m]."""
         self.progress_step = 0
@@ -67,10 +67,10 @@ class VehicleMotions:
         """Temporary goal of a yielding vehicle; None if the vehicle flies to its mission goal."""
         self.in_zone = False
         self.waits_for = ""
-        """Reason why the vehicle waits, as reported to the operator; empty if it does not wait."""
+        """What the vehicle waits for, in words for the operator; empty if it does not wait."""
 
         self.copies = 1
-        """Number of times that a motion is sent."""
+        """Number of times that each motion is sent."""
         self.prompt_count = 0
         """Number of motions in a row that were acknowledged promptly."""
         self.repeat: SentMotion | None = None
@@ -84,7 +84,7 @@ class VehicleMotions:
         return motions
 
     def adapt_copies(self, prompt: bool) -> None:
-        """Send motions more often after a loss, and less often after prompt acknowledgements."""
+        """Send each motion more often after a loss, less often after prompt acknowledgements."""
         self.prompt_count = self.prompt_count + 1 if prompt else 0
         if not prompt:
             self.copies = min(self.copies + 1, COPIES_MAX)
@@ -110,7 +110,7 @@ class VehicleMotions:
 
     @property
     def repeats(self) -> tuple[int, int]:
-        """Step of the latest motion sent, and number of steps for which it is repeated; or 0, 0."""
+        """Step of the latest motion sent, and number of steps in which it is repeated; or 0, 0."""
         if not self.sent:
             return 0, 0
         return self.sent[-1].step, (self.copies - 1) * COPY_STEPS

@@ -1,7 +1,7 @@
 """Waypoint selection: a vehicle's goal, a point on its route around zones, or a point to the right
-of it.
+of this route.
 
-A stuck vehicle also flies around resting vehicles for a while, and its waypoints turn further and
+A stuck vehicle also flies around resting vehicles for a while. Its waypoints turn further and
 further to the right, finally to random directions, so that vehicles that meet can pass.
 """
 
@@ -15,29 +15,28 @@ from skytether.shared.law.model import Array
 from skytether.shared.missions.zones import Zone, Zones
 
 WAYPOINT_M = 3.0
-"""Distance of a waypoint to the right of the route [m]."""
+"""Largest distance of a waypoint that is not on the route [m]."""
 AHEAD_M = 1.5
-"""Distance of a waypoint ahead on a route around zones [m]."""
+"""Distance along a route around zones to the waypoint on it [m]."""
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
-"""Angles to the right by which waypoints of a stuck vehicle turn: step, largest angle before random
-directions, and step back once the vehicle moves [rad]."""
+"""Angles by which waypoints of a stuck vehicle turn to the right [rad]: step, largest angle before
+random directions, and step back when the vehicle moves."""
 DETOUR_M, DETOUR_S = 5.0, 20.0
-"""Distance and time for which a stuck vehicle flies around resting vehicles [m, s]."""
+"""Range in which a stuck vehicle avoids resting vehicles [m], and time for which it does [s]."""
 CLOSED_M = 0.6
-"""Least distance ahead of a vehicle at which its route is closed [m]; at least three tubes."""
+"""Distance ahead of a vehicle at which its route is closed [m]; three tubes if that is more."""
 AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
-"""Corners of an octagon around 0, of radius 1; shape (8, 2)."""
+"""Corners of an octagon of radius 1 around the origin; shape (8, 2)."""
 TRIES = 5
-"""Number of directions tried at a step."""
+"""Number of directions tried at each plan."""
 
 
 class Waypoints:
     """Waypoints of the vehicles of a mission.
 
     Args:
-        tube_m: distance of motions from zones [m].
-        apart_m: distance of motions from each other [m].
-        detour_steps: number of steps for which a stuck vehicle flies around others.
+        tube_m: least distance of motions from zones [m]. apart_m: least distance of motions from
+        each other [m]. detour_steps: number of steps for which a stuck vehicle flies around others.
     """
 
     def __init__(
@@ -76,7 +75,7 @@ class Waypoints:
                 yield _along(place, way, AHEAD_M)
             yield way[0]
             vehicle.turned_rad = TURN
-            # If stuck, the route avoids resting vehicles too for the next `detour_steps`.
+            # All these failed: for `detour_steps` the route avoids resting vehicles, too.
             vehicle.detour = self._detour(place, goal, resting_places(), vehicle.closed)
             vehicle.detour_until = k + self._detour_steps
             way = vehicle.detour.way(place, goal)
@@ -102,7 +101,7 @@ class Waypoints:
         return vehicle.detour if vehicle.detour and uses_detour else self.routes
 
     def close_way(self, vehicle: VehicleMotions, k: int, place: Array, goal: Array) -> bool:
-        """Close the route ahead of a vehicle until it has another goal; False without another
+        """Close the route ahead of a vehicle until its goal changes; False if there is no other
         route.
 
         Routes keep `tube_m` from zones, and motions keep more: between two zones there may be
@@ -120,8 +119,8 @@ class Waypoints:
     def _detour(
         self, place: Array, goal: Array, resting: Iterable[Array], closed: Iterable[Array]
     ) -> RoutesAroundZones:
-        """Routes around zones, closed positions, and vehicles at rest nearby that are not at the
-        goal.
+        """Routes around zones, closed positions, and those nearby vehicles at rest that are not at
+        the goal.
         """
         zones, keep_m = list(self._zones.zones), self._apart_m - self._tube_m
         for at in resting:
@@ -138,7 +137,7 @@ class Waypoints:
 
 
 def _octagon(name: str, at: Array, radius_m: float, seen_from: Array) -> Zone:
-    """Octagon around a circle; a side faces `seen_from`, because a corner would be too near it."""
+    """Octagon around a circle; a side faces `seen_from`, because a corner would be too close."""
     half = np.pi / len(AROUND)
     x, y = seen_from[:2] - at[:2]
     c, s = np.cos(np.arctan2(y, x) + half), np.sin(np.arctan2(y, x) + half)

@@ -1,9 +1,9 @@
 """Yielding: vehicles at rest move aside for a vehicle that cannot pass them.
 
-A vehicle without progress towards its goal for a while requests that the first vehicle that blocks
-the way, at rest at its own goal, yields. This vehicle flies to a position off the way, waits there
-until the other has passed, and flies back. Only its goal changes: its motions are planned, checked
-and sent like any other.
+A vehicle without progress towards its goal for a while asks the first vehicle that rests at its own
+goal on the path to yield. The asked vehicle flies to a position off the path, waits there until the
+other has passed, and flies back. Only its goal changes: its motions are planned, checked and sent
+like any other.
 """
 
 from itertools import pairwise
@@ -21,27 +21,27 @@ YIELD_S = 30.0
 AHEAD_M = 4.0
 """Length of the path ahead on which vehicles are asked to yield [m]."""
 DIRECTIONS = 12
-"""Number of directions in which a yielding position is searched."""
+"""Number of directions in which a position for yielding is searched."""
 FURTHER = (1.2, 1.8, 2.7, 4.0)
-"""Distances of yielding positions from the goal, as multiples of the distance between vehicles."""
+"""Distances of such positions from the vehicle's goal, divided by the distance between vehicles."""
 
 NO_NEARER_M = 1e-4
-"""Tolerance for a vehicle that must not come nearer: motions are checked in pieces [m]."""
+"""Tolerance by which a vehicle that is too near may come nearer [m]; paths have straight pieces."""
 
 
 class Yielding(NamedTuple):
     place: Array
     """Temporary goal [m]; shape (axes,)."""
     asker: int
-    """Row of the vehicle that gets the right of way."""
+    """Row of the vehicle that asked, and gets the right of way."""
     until: int
-    """Step at which the yielding vehicle flies back, even if the other has not passed."""
+    """Common step at which the vehicle flies back, even if the other has not passed."""
 
 
 def first_on(way: Array, places: Array, apart_m: float) -> int | None:
     """Index of the first position to which a path comes too near, or None.
 
-    A position too near to the start of the path only counts if the path comes nearer to it.
+    A position that is too near to the start of the path counts only if the path approaches it.
 
     Args:
         way: the path: start, corners and end [m]; shape (n, axes).
@@ -62,15 +62,15 @@ def first_on(way: Array, places: Array, apart_m: float) -> int | None:
 def _kept_distance(places: Array, at: Array, apart_m: float) -> Array:
     """Distances to keep between a vehicle at `at` and vehicles at some positions [m]; shape (n,).
 
-    Plans keep a larger distance than motions must. A vehicle that is nearer already is only
-    forbidden to come nearer.
+    This is `apart_m`, the distance that plans keep. A vehicle that is nearer already may stay, but
+    not come nearer.
     """
     distance: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
     return distance
 
 
 def distance_from_way(places: Array, way: Array) -> Array:
-    """Distances of positions (n, axes) from a path (corners, axes) [m]; shape (n,)."""
+    """Distances of positions from a path [m]; shapes (n,), from (n, axes) and (corners, axes)."""
     starts, along = way[:-1], np.diff(way, axis=0)
     from_start = places[:, None] - starts
     length = np.maximum((along**2).sum(axis=1), 1e-12)
@@ -89,10 +89,10 @@ def place_to_yield(
     routes: RoutesAroundZones,
     clearance_m: float,
 ) -> Array | None:
-    """Nearest position off a path to which a vehicle at rest can go; None if there is none.
+    """Near position off a path to which a vehicle at rest can fly; None if there is none.
 
     Args:
-        home: position where it rests [m]; shape (axes,).
+        home: position at which the vehicle rests [m]; shape (axes,).
         way: path of the passing vehicle, from its position [m]; shape (n, axes).
         others: present or future resting positions of the other vehicles [m]; shape (m, axes).
         apart_m: distance between vehicles [m].

@@ -1,4 +1,4 @@
-"""Clearance of straight lines from zones, compiled."""
+"""Kernels that test whether straight lines keep a clearance from zones."""
 
 import numpy as np
 
@@ -12,12 +12,12 @@ is_near = shared(outlines.is_near)
 
 
 def comes_near(zones: Zones, points: Array, clearance_m: float) -> bool:
-    """Whether a line between successive points comes nearer to a zone than a clearance."""
+    """Whether a polyline through points comes nearer to a zone than a clearance."""
     return _comes_near(zones.outlines, points, clearance_m)
 
 
 def are_clear(zones: Zones, here: Array, there: Array, clearance_m: float) -> Flags:
-    """Whether lines (n, 2) in the plane keep a clearance from zones of any height; shape (n,)."""
+    """Whether horizontal lines keep a clearance from zones, whatever their heights; shape (n,)."""
     clear = np.empty(len(here), dtype=np.bool_)
     _are_clear(zones.outlines, here, there, clearance_m, clear)
     return clear
