@@ -1,4 +1,4 @@
-"""Initial values of each plan before it is solved, and its costs afterwards."""
+"""Values of each plan that are set before its QP is solved, and its costs afterwards."""
 
 from typing import NamedTuple
 
@@ -10,14 +10,14 @@ from skytether.server.planning.scheme import Foresight, PlanFigures
 from skytether.shared.base.kernel import B1, F1, F3, I1, S4, inline, lanes
 
 GENERATOR, TRACKER = 0, 1
-"""Index of each of the two MPCs in arrays."""
+"""Indices of the two MPCs, trajectory generator and tracker, in arrays."""
 
 
 class PlanMemory(NamedTuple):
     """Latest plans of both MPCs for every vehicle."""
 
-    # Inputs are float32, and states are computed from them again: 0.8 MB for a thousand vehicles.
-    # With float64 and stored states it was four times as large, and exceeded the cache of a core.
+    # The plans of a thousand vehicles take 0.8 MB, because inputs are float32 and states are not
+    # stored. With float64 and stored states they took four times as much, too much for a cache.
     inputs: S4
     """Latest inputs U(k-1) [m/s], rounded as sent; shape (2, capacity, axes, H)."""
     start: F3
@@ -38,15 +38,15 @@ class Draft(NamedTuple):
     guess: F3
     """Shifted plan of the previous step [m/s]; shape (block, axes, H)."""
     inputs: S4
-    """Inputs U(k) of both MPCs, rounded, because planning continues with the sent inputs [m/s];
-    shape (2, block, axes, H)."""
+    """Inputs U(k) of both MPCs [m/s], rounded as sent, because planning continues from the inputs
+    sent; shape (2, block, axes, H)."""
     distance: F1
-    """Scratch: squared distances [m²]; shape (H + 1,)."""
+    """Scratch: squared distances at each stage [m²]; shape (H + 1,)."""
 
 
 @inline
 def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -> None:
-    """Set a plan's steps, and `fresh`: no previous plan is usable."""
+    """Set a plan's steps, and `fresh`: whether the vehicle has no usable previous plan."""
     last, start = memory.step[row], k + ahead
     plan.row, plan.step, plan.start, plan.gap = row, k, start, start - last
     plan.solved = True
@@ -58,7 +58,7 @@ def begin(memory: PlanMemory, ahead: int, plan: PlanFigures, row: int, k: int) -
 def planned_state(
     mpc: MPC, memory: PlanMemory, plan: PlanFigures, axis: int
 ) -> tuple[float, float]:
-    """Planned state x_p(k|k-1) on one axis, from the generator's previous plan.
+    """Planned state x_p(k|k-1) on one axis, by the generator's previous plan [m, m/s].
 
     Source: eq. (14).
     """
@@ -79,12 +79,11 @@ def _deviate(
     axis: int,
     distance: F1,
 ) -> None:
-    """Add, on one axis, the squared deviations between the inputs `held` and the previous plan.
+    """Add one axis to the squared distances between the paths by `held` and the previous plan.
 
     Args:
         i: index of the vehicle in the block.
-        distance: input and output: sum over the axes at each stage of both [m²];
-            shape (H + 1,).
+        distance: input and output: sum over the axes so far, at each stage [m²]; shape (H + 1,).
     """
     held, usable = foresight.held[i, axis], foresight.usable[i]
     model, w, H = axis_at(mpc.model, axis), foresight.disturbance[i, axis], len(held)
@@ -112,10 +111,10 @@ def _add_gap(
     change: F1,
     cost: float,
 ) -> float:
-    """Add to `cost` twice the excess cost of other inputs over the optimal inputs on one axis.
+    """Sum of `cost` and twice the excess cost of other inputs over optimal inputs on one axis.
 
     Args:
-        x: difference of the state at stage 0 [m, m/s].
+        x: state at stage 0 with the other inputs minus that with the optimal ones [m, m/s].
         held: the other inputs [m/s]; shape (H,).
         u: the optimal inputs [m/s]; shape (H,).
         steep: `slope` at the optimum, nonzero where a bound is active; shape (H,).
@@ -148,7 +147,7 @@ def conclude(
     plan: PlanFigures,
     i: int,
 ) -> None:
-    """Fill in the figures of vehicle `i`'s plan, with V(k), and store the plan.
+    """Fill in the figures of vehicle `i`'s plan, such as V(k), and store the plan.
 
     Source: eq. (16).
     """
@@ -196,5 +195,5 @@ def conclude(
             copy(draft.inputs[which, i, axis], memory.inputs[which, row, axis])
         memory.start[row, axis, 0] = draft.planned[i, axis, 0]
         memory.start[row, axis, 1] = draft.planned[i, axis, 1]
-    # A failed first plan does not count as a previous plan.
+    # If the first QP is not solved, there is no previous plan at the next step.
     memory.step[row] = plan.start if plan.solved or not plan.fresh else -1

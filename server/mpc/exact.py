@@ -1,12 +1,12 @@
 """Exact solver of the QPs of `mpc`: an active-set method with a Riccati recursion per iteration.
 
 If the method of `server.mpc.riccati` does not converge, DAQP, a dual active-set method, solves the
-QP, and its answer is used only if it meets the optimality conditions.
+QP. DAQP's answer is used only if it meets the optimality conditions.
 
-For a single vehicle DAQP is as fast (24 µs for 10 in a hot loop, the same in a paced loop). This
-solver is kept for many vehicles: it solves them side by side, and takes 0.9 to 1.7 µs for each of
-64 and 0.8 to 1.8 µs for each of 1000, where DAQP, called for one vehicle after the other, takes 13
-to 17 and 21 to 29 µs (axes 2, H = 50; measured in one run at commit df76e24).
+For a single vehicle DAQP is as fast (24 µs for 10 in a hot loop, the same in a paced loop). For
+many vehicles this solver is faster, because it solves their QPs side by side: a vehicle takes 0.9
+to 1.7 µs with 64 vehicles and 0.8 to 1.8 µs with 1000. DAQP, called for one vehicle after the
+other, takes 13 to 17 and 21 to 29 µs (axes 2, H = 50; one run at commit df76e24).
 """
 
 import daqp
@@ -19,7 +19,7 @@ from skytether.shared.base.kernel import B1, F3, kernel
 from skytether.shared.law.model import Array, Flags
 
 SNAP = 1e-12
-"""Distance from the bound within which an input of DAQP is moved onto the bound [m/s]."""
+"""Distance from a bound up to which an input of DAQP is moved onto the bound [m/s]."""
 RESIDUAL_MAX = 1e-7
 """Largest residual of the optimality conditions of DAQP's answer, relative to the gradient."""
 
@@ -46,7 +46,7 @@ def _solve(
 
 
 class ExactSolver:
-    """See `server.mpc.solver.Solver`; apart from rounding, the answer depends only on the problem.
+    """Exact `server.mpc.solver.Solver`: apart from rounding, answers do not depend on guesses.
 
     Source: eq. (10).
     """
@@ -77,7 +77,7 @@ class ExactSolver:
         problem = self._problem
         hessian = problem.hessian[axis]
         bound = np.full(len(gradient), problem.mpc.bounds[axis])
-        # Without general constraints, DAQP uses the cheaper simple bounds.
+        # No general constraints, so that DAQP uses its faster method for simple bounds.
         nothing = np.zeros((0, len(gradient)))
         answer, _, status, info = daqp.solve(
             hessian, gradient, nothing, bound, -bound, primal_tol=1e-12, dual_tol=1e-12

@@ -2,12 +2,12 @@
 
 Both are the MPC of eq. (9), one after the other, each warm-started from its own previous plan. The
 generator plans from its own last prediction and never uses the vehicle's state (E17); the tracker
-controls the vehicle's estimated state along the generator's plan. The new plan is compared with the
-inputs already sent: V of eq. (16), and cost and deviation of the flight with these inputs.
+controls the vehicle's estimated state along the generator's plan. The figures of a plan are V of
+eq. (16), and the cost and deviation of the flight with the inputs sent before.
 
 With the exact solver all of this is one compiled pass for one or several vehicles
-(`server.mpc.problem`). With any other solver there are five steps: pose the generator's QP, solve;
-pose the tracker's QP, solve; conclude.
+(`server.mpc.problem`). With any other solver there are five steps: set up and solve the generator's
+QP; set up and solve the tracker's QP; compute the figures.
 """
 
 from typing import NamedTuple
@@ -62,14 +62,14 @@ class PlanBatch(NamedTuple):
     terminal_weight: F1
     """Terminal weight P on position and velocity; shape (2,)."""
     compares: bool
-    """Whether the inputs sent before are available, so that a plan is compared with them."""
+    """Whether plans are compared with the inputs sent before, which some schemes do not know."""
     memory: PlanMemory
     draft: Draft
     desired: Window
     foresight: Foresight
     figures: Figures
     together: F3
-    """Scratch for WIDTH vehicles, see `problem.simd_memory`."""
+    """Scratch memory for WIDTH vehicles, see `problem.simd_memory`."""
     alone: F3
     single: I1
     """Scratch: index of one vehicle in the block; shape (1,)."""
@@ -82,7 +82,7 @@ class PlanBatch(NamedTuple):
 def make_solver(control: ControlConfig, problem: Problem) -> Solver:
     if control.solver == "exact":
         return ExactSolver(problem)
-    # OSQP needs scipy, which takes 0.2 s and 40 MB.
+    # Imported here, because OSQP needs scipy, which takes 0.2 s and 40 MB.
     from skytether.server.mpc.osqp_solver import OsqpSolver
 
     return OsqpSolver(problem)
@@ -129,23 +129,23 @@ class Planner:
         self._picked = np.zeros(block, dtype=np.int64)
         self._settled = np.zeros(WIDTH, dtype=np.bool_)
         self.figures: Figures = np.zeros(block, dtype=FIGURES)
-        """Costs of the latest plans, in the first rows."""
+        """Figures of the latest plans, in the first rows; shape (block,)."""
         self.planned = self._draft.planned
         """Planned states x_p(k+d|k-1) of the latest plans [m, m/s]; shape (block, axes, 2)."""
         self.inputs = self._memory.inputs[TRACKER]
         """Latest planned inputs U of each vehicle [m/s]; shape (capacity, axes, H)."""
         self._batch: PlanBatch | None = None
         self.solve_ns = -1
-        """Time taken to plan for the last block [ns], or -1 if not measured."""
+        """Time that planning for the last block took [ns], or -1 if not measured."""
 
     def forget(self, row: int) -> None:
         self._memory.step[row] = -1
 
     def remember(self, rows: Indices, event: Flags) -> None:
-        """Ignore which plans are sent: the MPC continues from every plan."""
+        """Do nothing: the MPC continues from every plan, whether it was sent or not."""
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """Plan for vehicles: generator, then tracker; fills in `foresight.horizons` and `figures`.
+        """Plan with generator, then tracker; fills in `foresight.horizons` and `figures`.
 
         Source: eqs. (14), (15).
         """
@@ -159,8 +159,7 @@ class Planner:
 
     def _plan_all(self, batch: PlanBatch, rows: Indices, step: Indices) -> None:
         solver, undone = self.solvers[LATER], len(rows)
-        # Not isinstance: a derived solver may override `solve`, which the compiled pass would not
-        # call.
+        # Not isinstance: the compiled pass would not call the `solve` of a derived class.
         if type(solver) is ExactSolver:
             undone = _plan(batch, rows, step, solver.work)
         if undone:
@@ -186,8 +185,8 @@ class Planner:
     def _plan_with_solvers(
         self, batch: PlanBatch, rows: Indices, step: Indices, undone: int
     ) -> None:
-        """Plan with the solvers for all vehicles, or for those that the compiled pass left
-        unsolved.
+        """Plan with `solvers` for all vehicles, or for those whose QP the compiled pass has not
+        solved.
         """
         left = np.arange(len(rows))
         if undone < len(rows):
@@ -209,7 +208,7 @@ class Planner:
 
 @part
 def _pose_generator(batch: PlanBatch, simd: SimdBatch, indices: I1, which: int, axis: int) -> None:
-    """Set up the generator's QP on one axis for some vehicles, by index in the block.
+    """Set up the generator's QPs on one axis for vehicles, given by index in the block.
 
     Source: eq. (14).
     """
@@ -239,7 +238,7 @@ def _pose_generator(batch: PlanBatch, simd: SimdBatch, indices: I1, which: int, 
 
 @part
 def _pose_tracker(batch: PlanBatch, simd: SimdBatch, indices: I1, which: int, axis: int) -> None:
-    """Set up the tracker's QP on one axis, with the generator's solution in `simd.inputs`.
+    """Set up the tracker's QPs on one axis; `simd.inputs` has the generator's solutions.
 
     Source: eq. (15).
     """
@@ -259,7 +258,7 @@ def _pose_tracker(batch: PlanBatch, simd: SimdBatch, indices: I1, which: int, ax
 
 @part
 def _keep(batch: PlanBatch, simd: SimdBatch, indices: I1, tier: int, axis: int) -> None:
-    """Store the solutions of generator or tracker on one axis, rounded as sent."""
+    """Store the generator's or tracker's solutions on one axis, rounded as sent."""
     for lane in range(len(indices)):
         i = indices[lane]
         batch.memory.bounded[batch.figures[i].row] |= simd.active[lane] > 0.0
@@ -270,7 +269,7 @@ def _keep(batch: PlanBatch, simd: SimdBatch, indices: I1, tier: int, axis: int) 
 def _plan_some(
     batch: PlanBatch, memory: F3, indices: I1, which: int, work: RiccatiWorkspace
 ) -> int:
-    """Plan at once for vehicles of the block, given by index; returns the number of failures."""
+    """Plan together for vehicles given by index; returns the number of unsolved plans."""
     mpc, draft, figures, compares = batch.mpc, batch.draft, batch.figures, batch.compares
     simd, settled, undone = simd_batch(memory), batch.settled[: len(indices)], 0
     for lane in range(len(indices)):
@@ -318,15 +317,15 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
     """
     memory, foresight, figures = batch.memory, batch.foresight, batch.figures
     picked, undone = batch.picked, 0
-    # An iteration without any input at its bound takes a third of the time. So vehicles whose
-    # inputs were at a bound are planned for together, collected from the back; all others from the
-    # front.
+    # An iteration for vehicles without any input at a bound takes a third of the time. So vehicles
+    # whose inputs were at a bound are grouped: they fill `picked` from the back, all others from
+    # the front.
     waiting, last = 0, len(rows)
     for i in range(len(rows)):
         begin(memory, foresight.ahead[i], figures[i], rows[i], steps[i])
         if figures[i].fresh:
-            # Vehicles planned for together need the same weights; a first plan has other weights
-            # (E8), and is rare.
+            # Planned alone: vehicles planned for together need the same weights, and a first plan
+            # has other weights (E8). First plans are rare.
             batch.single[0] = i
             undone += _plan_some(batch, batch.alone, batch.single, FIRST, work)
         elif memory.bounded[rows[i]]:
@@ -342,7 +341,7 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
     while waiting - first >= WIDTH:
         undone += _plan_some(batch, batch.together, picked[first : first + WIDTH], LATER, work)
         first += WIDTH
-    # Too few vehicles are left for a full batch; planned singly, each gets the same bits
+    # The vehicles left are too few for a full batch. Planned alone, each gets the same bits
     # (tests/mpc/test_hierarchical.py).
     for at in range(first, waiting):
         undone += _plan_some(batch, batch.alone, picked[at : at + 1], LATER, work)
@@ -351,7 +350,7 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
 
 @kernel
 def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
-    """Set up the generator's or tracker's QPs of the vehicles `left` for another solver."""
+    """Set up the generator's or tracker's QPs of the vehicles `left` for `Planner.solvers`."""
     draft, simd, single = batch.draft, simd_batch(batch.alone), batch.single
     for i in left:
         plan, single[0] = batch.figures[i], i
@@ -369,19 +368,19 @@ def _pose(batch: PlanBatch, rows: I1, steps: I1, left: I1, tier: int) -> None:
 
 
 def start_plans(batch: PlanBatch, rows: Indices, step: Indices) -> None:
-    """Set the steps of plug-in plans, and `draft.guess`: the previous plans, shifted [m/s]."""
+    """Set the steps of a plug-in's plans, and `draft.guess` to the shifted previous plans."""
     _pose(batch, rows, step, np.arange(len(rows)), GENERATOR)
 
 
 def conclude_given(batch: PlanBatch, n: int) -> None:
-    """Compare plug-in plans with the sent inputs, and store them; slope taken as 0."""
+    """Compare a plug-in's plans with the inputs sent before, assuming slope 0; store the plans."""
     batch.draft.gradient[:n] = 0.0
     _conclude_all(batch, np.arange(n), False)
 
 
 @kernel
 def _conclude_all(batch: PlanBatch, left: I1, sloping: bool) -> None:
-    """Fill in figures and store plans; `sloping`: `draft.gradient` has g, not yet the slope."""
+    """Fill in figures, store plans; `sloping`: `draft.gradient` still has g, not the slope."""
     draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
         which = FIRST if batch.figures[i].fresh else LATER

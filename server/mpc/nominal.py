@@ -1,9 +1,9 @@
-"""Nominal MPC: plan that becomes the trajectory if the server sees the reference ahead.
+"""Nominal MPC: its plan becomes the trajectory if the server sees the reference ahead.
 
-It is the MPC of eq. (9) for an undisturbed vehicle, starting from the reference state at step k,
-along the desired trajectory as far as the server sees it, within the input bounds of eq. (6). The
-vehicle follows the planned states, so a trajectory never exceeds the vehicle's abilities: the
-trajectory turns early before a sharp corner, and cuts small corners.
+The nominal MPC is the MPC of eq. (9) for an undisturbed vehicle, within the input bounds of eq.
+(6). It starts from the reference state at step k, and follows the reference as far as the server
+sees it. The vehicle follows the planned states, so a trajectory never exceeds the vehicle's
+abilities: it turns early before a sharp corner, and cuts small corners.
 """
 
 from typing import NamedTuple
@@ -29,7 +29,7 @@ from skytether.shared.scenario.schema import ControlConfig
 
 
 class Nominal(NamedTuple):
-    """Nominal problem, and the previous plans of all vehicles for warm starts."""
+    """Problem of the nominal MPC, and the previous plans of all vehicles for warm starts."""
 
     mpc: MPC
     """Problem of eq. (9), without S-term."""
@@ -59,8 +59,8 @@ def plan_nominal(nominal: Nominal, row: int, k: int, desired: F3, states: F3) ->
 
     Args:
         desired: states from k on [m, m/s]; shape (axes, H + 1 or more, 2).
-        states: output, after the first stage, which contains the reference state at k [m, m/s];
-            shape (axes, H + 1 or fewer, 2).
+        states: output from stage 1 on; stage 0 is input, the reference state at k [m, m/s]; shape
+            (axes, H + 1 or fewer, 2).
     """
     mpc, settled, simd = nominal.mpc, nominal.settled, simd_batch(nominal.work.memory)
     gap, H = k - nominal.step[row], nominal.inputs.shape[2]

@@ -1,8 +1,8 @@
 """OSQP as a solver of the QPs of `server.mpc.problem`, a reference for the exact solver.
 
-OSQP's interface checks little: a wrong length gives NaN, a NaN stays in its warm start for ever,
-and an iteration limit does not raise. So inputs and results are checked here, and each solve sets
-its own warm start, so that an answer depends on its problem and guess alone.
+OSQP's interface checks little: a vector of wrong length gives NaN, a NaN stays in its warm start
+for ever, and reaching the iteration limit raises no exception. So inputs and results are checked
+here. Each call sets its own warm start, so that the answer depends only on problem and guess.
 """
 
 import numpy as np
@@ -16,13 +16,13 @@ from skytether.shared.law.model import Array, Flags
 
 ITERATIONS_MAX = 4000
 TOLERANCE = 1e-9
-"""Tolerance of both residuals: after 30 iterations inputs are accurate to about 1e-8 m/s."""
+"""Tolerance of both residuals; inputs are then accurate to about 1e-8 m/s, after 30 iterations."""
 RHO_PER_CURVATURE = 2.5
 """OSQP's step size divided by the Hessian's mean curvature; chosen for few iterations."""
 
 
 class OsqpSolver:
-    """OSQP, set up once per axis; only vectors change afterwards.
+    """OSQP, set up once for each axis; later only the vectors of a problem change.
 
     Source: eq. (10).
     """
@@ -51,7 +51,7 @@ class OsqpSolver:
         if not (np.isfinite(gradient).all() and np.isfinite(guess).all()):
             raise SolverFailed("problem not finite")
         problem, bound = self._axes[axis], self._u_max[axis]
-        # Multipliers for which the guess is stationary at active bounds; zero elsewhere.
+        # Multipliers that make the guess stationary at active bounds; zero elsewhere.
         slope = self._hessian[axis] @ guess + gradient
         multipliers = np.where(np.abs(guess) >= NEAR * bound, -slope, 0.0)
         problem.update(q=gradient)
