@@ -53,8 +53,8 @@ class NetemOptions(ProcessOptions):
 
     scenario: command.ScenarioName = NETWORK
     """A scenario's name (`skytether list scenarios`) or a .toml file, for its network and seed.
-    Given one, netem belongs to a flight: a packet's fate depends on the time, not on the packet's
-    number in its flow."""
+    With a scenario netem belongs to a flight: a packet's fate depends on the time, not on the
+    packet's number in its flow."""
     bind: str = "127.0.0.1:47000"
     """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host is written in
     brackets, as in [::1]:47000; its socket receives IPv6 only, even for [::]. A name means its IPv4
@@ -156,7 +156,7 @@ def emulate_for(argv: Sequence[str]) -> None:
     Linux and slirp4netns, and root or user namespaces.
 
     SIGUSR1 prints the counters so far to stderr; with --control, `skytether set` changes the
-    impairments in flight. All other signals are passed to the program.
+    impairments while the program runs. All other signals are passed to the program.
     """
     from skytether.netem.tunnel import Tunnel
     from skytether.shell.driving.program import ProgramError, program

@@ -48,7 +48,7 @@ class Codel:
     dropping: bool = False
 
     def drops(self, now_ns: int, *, is_fine: bool) -> bool:
-        """Whether to drop the first packet; `is_fine`: it waited shortly, or few packets wait."""
+        """Whether to drop the first packet; `is_fine`: short wait, or queue nearly empty."""
         late = False
         if is_fine:
             self.above_ns = 0

@@ -1,8 +1,8 @@
 """Both directions of an emulated network, independent of what it carries: see `proxy` for
 datagrams, `relay` for byte streams and `tunnel` for packets of IP.
 
-As in the paper, the uplink leads to the vehicle; without a vehicle, to a proxy's client or a
-tunnel's program. There the directions have other names (`shared.endpoints.directions`).
+As in the paper, the uplink leads to the vehicle. Without a vehicle, it leads to a proxy's client or
+a tunnel's program (other names: `shared.endpoints.other_directions`).
 """
 
 from abc import abstractmethod

@@ -99,7 +99,7 @@ class Counts:
     error: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN_NS))
     """Time from a packet's due time until it was forwarded."""
     queueing: Histogram = field(default_factory=lambda: Histogram(QUEUEING_BIN_NS))
-    """Time of each packet in the bottleneck."""
+    """Time that each packet spent in the bottleneck."""
 
 
 QueuedPacket = tuple[int, int, Datagram, int, Lane, int, int, bool]

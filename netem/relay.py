@@ -3,8 +3,8 @@
 A stream has no packets that could be lost. Each piece of a stream passes the same impairments as a
 packet; a piece that would be lost holds up its stream and is tried again every RETRY_NS, similar to
 a retransmission. Pieces never overtake each other, and are neither copied nor damaged. While a
-queue is full, nothing is read from its connections. TCP itself sees no packet loss, and does not
-react to it; for that its packets must be emulated, see `netem.tunnel`.
+queue is full, nothing is read from its connections. So TCP never sees a packet loss here; only
+emulation of its packets shows its reaction to loss, see `netem.tunnel`.
 
 The ends of connection N are the peers `(CLIENT, N)` and `(SERVER, N)`; an empty piece means that an
 end sends no more.

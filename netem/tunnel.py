@@ -18,7 +18,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 FLOWS_MAX = 16_384
-"""Largest number of flows stored; a further flow replaces the one silent longest."""
+"""Largest number of flows stored; a further one replaces the flow that was silent longest."""
 
 
 class Tunnel(Emulator):

@@ -13,7 +13,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Message, Observation, RoomMessage
 
 ROOM, MESSAGES = "skytether.server.standby", "skytether.shared.wire.lead"
-"""Module that plans for vehicles with two servers, and module of their messages."""
+"""Module for vehicles with two servers, and module of the messages of such vehicles."""
 
 
 class Decider(Protocol):

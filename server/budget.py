@@ -5,8 +5,8 @@ bytes, in this order:
 
 1. urgent packets: a plan that replaces a heartbeat, and the first plan of a vehicle. They are
    always granted, like heartbeats, and leave fewer bytes for the others;
-2. vehicles that got no packet for WAIT_S, longest wait first, so that none is neglected; 3. all
-other vehicles, those with the largest figure of the trigger per byte first.
+2. vehicles that got no packet for WAIT_S, longest wait first, so that none is neglected;
+3. all other vehicles, those with the largest figure of the trigger per byte first.
 
 The budget is a token bucket with b bytes: b ← b + r Δt, within ± r BURST_S, minus the bytes sent,
 headers included. Urgent packets may make b negative. So a window of T seconds has at most r (T +

@@ -84,7 +84,7 @@ class Controller:
         self._clock = clock
         self.desired = Desired(scenario, terms, capacity, block, references)
         self.faults: list[str] = []
-        """Tracebacks of plug-ins' errors, the first of each plug-in, that are not reported yet."""
+        """Tracebacks that are not reported yet, of the first error of each plug-in."""
         fleet = Fleet(
             scenario,
             terms,
@@ -113,7 +113,7 @@ class Controller:
         self.change_trigger(control)
         self._stopwatch = stopwatch
         self.last_step = np.full(capacity, -1, dtype=np.int64)
-        """Latest step of each vehicle with a decision, or -1; shape (capacity,)."""
+        """Latest step of each vehicle for which a decision was made, or -1; shape (capacity,)."""
         self.observed_step = self.scheme.observed_step
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.idle = np.zeros(capacity, dtype=np.int64)

@@ -1,8 +1,8 @@
 """Impairments of the network, which delay, lose or change packets; all are in IMPAIRMENTS.
 
     impairment  base class, and an example of an impairment
-    direction the impairments of one direction, parsed from the text of a scenario draws random
-    numbers of impairments, from the seed and the packet
+    direction   the impairments of one direction, parsed from the text of a scenario
+    draws       random numbers of impairments, from the seed and the packet
 
     delays, distributions      random delays
     losses, outages, damage    packets lost, at random or for a time; duplicated and corrupted

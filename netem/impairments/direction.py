@@ -2,7 +2,7 @@
 
 Every packet first passes the queue of `rate` or `deliveries`, if there is one. Then the other
 impairments act on the packet, with random numbers for the time at which it entered: delays add up,
-and one loss suffices.
+and one impairment suffices to lose it.
 """
 
 from functools import lru_cache

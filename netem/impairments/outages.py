@@ -66,7 +66,7 @@ class Outages(Impairment):
 
 @impairment(name="delivered")
 class Delivered(Impairment):
-    """Delivers packets within delay_s; each stretch of time is flow, at_s, for_s, delay_s."""
+    """Delivers a flow's packets within delay_s in periods, each flow, at_s, for_s, delay_s."""
 
     def __init__(self, *stretches: Annotated[float, Meta(ge=0, le=86400)]) -> None:
         each = list(zip(*(iter(stretches),) * 4, strict=False))

@@ -5,7 +5,7 @@
     mission_state    motions that each vehicle may fly (`vehicle_motions`), in arrays for
                      kernels (`possible_motions`, `compiled_motion`)
     led_vehicles     vehicles that follow this server, with a standby server or without
-    waypoints next target of a vehicle: its goal, or a point on its route (`routes`)
+    waypoints        next target of a vehicle: its goal, or a point on its route (`routes`)
     yielding         vehicles at rest move out of the way
     trajectory_qp    the QP for a new motion; its constraints: `half_planes`, `separation`,
                      `zone_clearance`

@@ -67,8 +67,8 @@ def half_planes(
         row: row of the vehicle; its own motions are ignored.
         lands: first step at which the vehicle may begin to land, or NEVER.
         possible: motions of all vehicles.
-        distance_m: distance to keep [m]; less if the motion in force is nearer already. error:
-        error of the vehicle's step number by the server's count.
+        distance_m: distance to keep [m]; less if the motion in force is nearer already.
+        error: error of the vehicle's step number by the server's count.
     """
     capacity = len(times) * possible.count
     planes = HalfPlanes(

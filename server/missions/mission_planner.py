@@ -5,10 +5,10 @@ that. A motion is sent as a trajectory with all its knots, so a vehicle that rec
 packet flies the motion to its end and hovers there. For each vehicle the server stores every motion
 that the vehicle may fly:
 
-- the motion in force, which the newest observation acknowledges; and - each motion sent since, as
-long as the vehicle may still accept its packet. The vehicle accepts a motion no later than
-`link.join_s` after its first knot, so a later observation shows reliably whether the vehicle has
-accepted the motion.
+- the motion in force, which the newest observation acknowledges; and
+- each motion sent since, as long as the vehicle may still accept its packet. The vehicle accepts a
+  motion no later than `link.join_s` after its first knot, so a later observation shows reliably
+  whether the vehicle has accepted the motion.
 
 A new motion is sent only if at all times it keeps the distance
 
@@ -264,7 +264,7 @@ class MissionPlanner(SplineScheme):
         return {name: value for name, value in figures.items() if value is not None}
 
     def _clock_m(self, row: int) -> float | None:
-        """Largest distance of a vehicle along its motion by its clock error [m]; None if unknown.
+        """Largest shift of a vehicle along its motion by its clock error [m]; None if unknown.
 
         Other vehicles keep this additional distance along its path.
         """
@@ -535,8 +535,8 @@ class MissionPlanner(SplineScheme):
         return conflicts
 
     def _enters_zone(self, points: Array) -> bool:
-        """Whether a polyline comes too near to a zone, except to a zone at its start that it leads
-        away from.
+        """Whether a polyline comes too near to a zone; it may lead away from a zone that is too
+        near at its start.
         """
         clearance_m = self._clearances.tube_m + self._clearances.bend_m
         if not comes_near(self._zones, points, clearance_m):

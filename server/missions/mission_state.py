@@ -99,7 +99,7 @@ class MissionState:
         self._clock, self._dt_ns = clock, terms.dt_ns
         self.counts: Counter[str] = Counter()
         self.events: list[Event] = []
-        """Events for the operator, which the caller removes."""
+        """Events for the operator; the caller removes them from the list."""
         self.margins = {"tube": 0.0, "join": 0.0}
         """Largest distance of a vehicle from its motion, and largest time after a motion's first
         knot at which it was accepted, each as a share of the value that the theorem assumes."""
@@ -327,7 +327,7 @@ class MissionState:
         if self._land_after == NEVER:
             return
         match observation.mode:
-            # Not at the first observation: before it the client may have counted other steps.
+            # Not at the first observation: the client may have counted other steps before it.
             case Mode.HOVER if lands[row] < NEVER and self.rows.heard[row]:
                 # The vehicle may land from now on, but not before the step computed earlier.
                 lands[row] = max(lands[row], k)

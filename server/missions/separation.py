@@ -70,7 +70,8 @@ def too_near(
         in_force: motion in force of the same vehicle. If it is too near already (by more than the
             error of straight pieces), the planned motion may be nearer by NEARER_M at most: so the
             vehicle can always fly away.
-        begin: first step to compare. row: row of the vehicle; its own motions are ignored.
+        begin: first step to compare.
+        row: row of the vehicle; its own motions are ignored.
         distance_m: distance to keep from the possible motions [m].
     """
     is_near = np.zeros(possible.count + 1, dtype=np.bool_)
@@ -257,7 +258,8 @@ def _least_distance_within(
                 p01 = _difference(pair, span.begin, next_shift, x)
                 p11 = _difference(pair, span.end, next_shift, x)
             if x == ALTITUDE:
-                # A vehicle that may pass the other's height does so anywhere in this interval.
+                # A vehicle that may pass the other's height in this interval may do so at any
+                # time in it.
                 high, low = max(p00, p10, p01, p11), min(p00, p10, p01, p11)
                 if (span.descends and high > 0.0) or (span.other_descends and low < 0.0):
                     p00, p10, p01, p11 = 0.0, 0.0, 0.0, 0.0

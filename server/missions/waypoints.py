@@ -35,8 +35,9 @@ class Waypoints:
     """Waypoints of the vehicles of a mission.
 
     Args:
-        tube_m: least distance of motions from zones [m]. apart_m: least distance of motions from
-        each other [m]. detour_steps: number of steps for which a stuck vehicle flies around others.
+        tube_m: least distance of motions from zones [m].
+        apart_m: least distance of motions from each other [m].
+        detour_steps: number of steps for which a stuck vehicle flies around others.
     """
 
     def __init__(
@@ -75,7 +76,7 @@ class Waypoints:
                 yield _along(place, way, AHEAD_M)
             yield way[0]
             vehicle.turned_rad = TURN
-            # All these failed: for `detour_steps` the route avoids resting vehicles, too.
+            # These waypoints failed: for `detour_steps` routes avoid resting vehicles, too.
             vehicle.detour = self._detour(place, goal, resting_places(), vehicle.closed)
             vehicle.detour_until = k + self._detour_steps
             way = vehicle.detour.way(place, goal)

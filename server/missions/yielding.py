@@ -26,7 +26,7 @@ FURTHER = (1.2, 1.8, 2.7, 4.0)
 """Distances of such positions from the vehicle's goal, divided by the distance between vehicles."""
 
 NO_NEARER_M = 1e-4
-"""Tolerance by which a vehicle that is too near may come nearer [m]; paths have straight pieces."""
+"""Distance by which a vehicle that is too near may still come nearer: a tolerance [m]."""
 
 
 class Yielding(NamedTuple):
@@ -70,7 +70,7 @@ def _kept_distance(places: Array, at: Array, apart_m: float) -> Array:
 
 
 def distance_from_way(places: Array, way: Array) -> Array:
-    """Distances of positions from a path [m]; shapes (n,), from (n, axes) and (corners, axes)."""
+    """Distances of positions (n, axes) from a path (corners, axes) [m]; shape (n,)."""
     starts, along = way[:-1], np.diff(way, axis=0)
     from_start = places[:, None] - starts
     length = np.maximum((along**2).sum(axis=1), 1e-12)
@@ -89,7 +89,7 @@ def place_to_yield(
     routes: RoutesAroundZones,
     clearance_m: float,
 ) -> Array | None:
-    """Near position off a path to which a vehicle at rest can fly; None if there is none.
+    """Position off a path to which a vehicle can fly from `home`; None if there is none.
 
     Args:
         home: position at which the vehicle rests [m]; shape (axes,).

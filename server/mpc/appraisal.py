@@ -17,7 +17,7 @@ class PlanMemory(NamedTuple):
     """Latest plans of both MPCs for every vehicle."""
 
     # The plans of a thousand vehicles take 0.8 MB, because inputs are float32 and states are not
-    # stored. With float64 and stored states they took four times as much, too much for a cache.
+    # stored. With float64 and states it was four times as much, more than the cache of a core.
     inputs: S4
     """Latest inputs U(k-1) [m/s], rounded as sent; shape (2, capacity, axes, H)."""
     start: F3

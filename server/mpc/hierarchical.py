@@ -62,7 +62,7 @@ class PlanBatch(NamedTuple):
     terminal_weight: F1
     """Terminal weight P on position and velocity; shape (2,)."""
     compares: bool
-    """Whether plans are compared with the inputs sent before, which some schemes do not know."""
+    """Whether plans are compared with the inputs sent before; only some schemes know these."""
     memory: PlanMemory
     draft: Draft
     desired: Window
