@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.commandline.start import run
 
-if __name__ == "__main__":  # called before the slow imports below
+if __name__ == "__main__":  # run first: the imports below are slow
     sys.exit(run("skytether.netem.__main__:emulate", "netem"))
 
 import gc
@@ -190,7 +190,7 @@ def emulate_for(argv: Sequence[str]) -> None:
 
 
 def _exposed(text: str) -> Address:
-    """IPv4 address and port at which to listen for a server of the program."""
+    """IPv4 address and port of --expose, from which packets go to the program."""
     host, colon, _ = text.rpartition(":")
     why = ""
     if host.isdecimal():

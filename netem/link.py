@@ -77,7 +77,7 @@ class Counts:
     forwarded: int = 0
     """Packets that have left."""
     undelivered: int = 0
-    """Packets that could not be sent on, or were refused later; they do not count as forwarded."""
+    """Packets that could not be sent on, or that the receiver refused; not counted as forwarded."""
     lost: int = 0
     """Packets lost by impairments."""
     reordered: int = 0

@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.commandline.start import run
 
-if __name__ == "__main__":  # called before the slow imports below
+if __name__ == "__main__":  # run first: the imports below are slow
     sys.exit(run("skytether.server.__main__:serve", "server"))
 
 import secrets
@@ -115,7 +115,7 @@ def _ready(scenario: Scenario) -> None:
     are forked, so that they share memory, and before the first tick, so that it is on time.
     """
     for room in (assignment.ROOM, routes.ROOM):
-        with suppress(ConfigError):  # without the module its messages are refused
+        with suppress(ConfigError):  # without the module, its messages are refused
             load(room, "a message")
     others = loading.others(scenario)
     terminal.prepare(machine_code.missing(without=others))
@@ -151,7 +151,7 @@ def _work(
     gate: Gate = PlainGate()
     forms: tuple[Form, ...] = ()
     if keyring:
-        from skytether.server.secure import FORMS, SecureGate  # ciphers: 30 ms, 9 MB
+        from skytether.server.secure import FORMS, SecureGate  # loads ciphers: 30 ms, 9 MB
 
         gate, forms = SecureGate(keyring, entropy=secrets.token_bytes), FORMS
     axes, control = options.config.model.axes, options.config.control

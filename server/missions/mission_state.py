@@ -124,7 +124,7 @@ class MissionState:
         self._land_after = terms.land_after if lands(scenario) else NEVER
         """Number of steps without packets after which a hovering vehicle lands."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
-        """Time constant [s] and deceleration [m/s²] of braking without a motion."""
+        """Time constant [s] and twice the deceleration [m/s²] of braking without a motion."""
         self.now = 0
         """Present step on the common grid: whole steps of the server's clock."""
         self.rows = VehicleRows.of(capacity)
