@@ -19,7 +19,7 @@ class LedVehicles:
         """Rows of vehicles that this server has begun to lead but has not observed since, with the
         first step of observations that count."""
         self.missing: int | None = None
-        """Row of a vehicle because of which no motion may be planned; None if there is none."""
+        """Row of a vehicle that keeps the server from planning motions; None if there is none."""
 
     def follow(self, row: int, lead: Lead | None) -> bool:
         """Note a vehicle's leader; return whether `lead` may contain a motion to take over."""

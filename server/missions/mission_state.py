@@ -126,7 +126,7 @@ class MissionState:
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
         """Time constant [s] and twice the deceleration [m/s²] of braking without a motion."""
         self.now = 0
-        """Present step on the common grid: whole steps of the server's clock."""
+        """Present step on the common time grid, which counts steps of the server's clock."""
         self.rows = VehicleRows.of(capacity)
         self._all = np.arange(capacity)
         self.observed_step: Indices = self.rows.observed_step
@@ -216,11 +216,11 @@ class MissionState:
         return PossibleMotion(self.in_common(row, motion), self.lands(row), self.error(row))
 
     def in_common(self, row: int, motion: Motion) -> Motion:
-        """Motion of a vehicle, converted to steps of the common grid."""
+        """Motion of a vehicle, converted to steps of the common time grid."""
         return motion._replace(first=motion.first - self.ahead(row))
 
     def lands(self, row: int) -> int:
-        """First common step at which a vehicle may begin to land, or NEVER."""
+        """First step on the common time grid at which a vehicle may begin to land, or NEVER."""
         lands = int(self.rows.lands[row])
         return lands if lands == NEVER else lands - self.ahead(row)
 
@@ -436,7 +436,7 @@ def _align(
     """Map vehicles to the common time grid, and set PLAN_DUE and REPEAT_DUE for each.
 
     Args:
-        now: present step on the grid.
+        now: present step on the common time grid.
         due: output: PLAN_DUE, REPEAT_DUE, both or 0; shape (n,) at least.
         moved_by: output: change of the offset from the grid [steps]; shape (n,) at least.
 

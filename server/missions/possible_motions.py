@@ -28,7 +28,7 @@ NEVER = 2**62
 
 
 class PossibleMotion(NamedTuple):
-    """Motion that a vehicle may be flying, in steps of the common grid."""
+    """Motion that a vehicle may be flying, in steps of the common time grid."""
 
     motion: Motion
     lands: int = NEVER
