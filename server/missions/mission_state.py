@@ -366,7 +366,7 @@ class MissionState:
         return first if np.linalg.norm(first - observed) < self._tube_m else observed
 
     def align(self, rows: Indices, step: Indices) -> None:
-        """Map the steps of all vehicles to the common grid, and discard unsent decisions."""
+        """Map steps of all vehicles to the common time grid, and discard unsent decisions."""
         n, self._is_updated = len(rows), False
         self.now = self._clock.tick_ns // self._dt_ns
         moved, foreign = _align(rows, step, self.now, self.rows, self.due, self._moved_by)
