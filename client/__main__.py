@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.commandline.start import run
 
-if __name__ == "__main__":  # called before the slow imports below
+if __name__ == "__main__":  # run first: the imports below are slow
     sys.exit(run("skytether.client.__main__:fly", "client"))
 
 import secrets
