@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from skytether.shell.driving.memory import MemoryFile
 
 NONE = "none"
-"""Value of --standby for no standby server."""
+"""Value of --standby that means: no standby server."""
 
 
 @dataclass(frozen=True)
@@ -80,24 +80,24 @@ class ClientOptions(ProcessOptions):
     number: Annotated[int, Argument(name="id")] = 1
     """Number of this vehicle (0 to 65535), unique among the vehicles of a server."""
     vehicles: Annotated[int, Argument(metavar="N")] = 1
-    """Number of vehicles to fly in this process, numbered from --id on."""
+    """Number of vehicles to fly in this process; the first has the number --id."""
     keys: Path | None = None
     """File with the vehicle's key, made by `skytether keygen`. Without it the link is plaintext,
     which is refused unless the server is on this machine."""
     key_id: Annotated[int | None, Argument(metavar="N")] = None
-    """Number of the key to use if the vehicle has two; by default the highest."""
+    """Number of the key to use if the file has two keys of the vehicle; by default the highest."""
     set_parameters: bool = False
     """If the autopilot reacts unsafely to set-points that stop, set its parameters to safe values.
     Without --set-parameters, unsafe values are only reported, and the vehicle is not armed."""
     insecure: bool = False
-    """Accept a plaintext link to another machine: anybody on the network between can fly the
-    vehicle."""
+    """Accept a plaintext link to another machine: anybody on the network between the two machines
+    can then fly the vehicle."""
     json: Path | None = None
-    """File for the client's summary of the flight; for several vehicles, for counters and CPU
-    time."""
+    """File for the client's summary of the flight, or for counters and CPU time if it flies several
+    vehicles."""
     new_flight: bool = False
     """Begin a new flight: ignore what an earlier run saved in `vehicle.memory` and what was set in
-    flight. Give it by hand only, never in the command of a service."""
+    flight. Give --new-flight by hand only, never in the command of a service."""
 
 
 def fly(argv: Sequence[str]) -> None:
@@ -125,7 +125,7 @@ def fly(argv: Sequence[str]) -> None:
         if keyring is None:
             return PlainLink()
 
-        from skytether.client.secure import SecureLink  # imports ciphers: slow, 6 MB
+        from skytether.client.secure import SecureLink  # slow: loads 6 MB of ciphers
 
         return SecureLink(keyring.of(number, options.key_id), entropy=secrets.token_bytes)
 
@@ -144,7 +144,7 @@ def fly(argv: Sequence[str]) -> None:
         flying = [vehicles.make(scenario, number) for number in numbers]
         memory = stack.enter_context(_memory(options, flying, keyring))
         make = _saving(memory, scenario, numbers[0], running.warnings) if memory else Client
-        if kernel := sys.modules.get("skytether.shared.base.kernel"):  # a simulation with kernels
+        if kernel := sys.modules.get("skytether.shared.base.kernel"):  # a compiled simulation
             from skytether.shared.base import machine_code
 
             terminal.prepare(machine_code.missing())
@@ -264,7 +264,7 @@ def _servers(paths: Sequence[NetworkPath], standby: Sequence[NetworkPath]) -> st
 def _memory(
     options: ClientOptions, flying: Sequence[Vehicle], keyring: "Keyring | None"
 ) -> "Iterator[MemoryFile | None]":
-    """File that keeps the client's state for its next run; None with `vehicle.memory = "none"`.
+    """File that keeps the client's state for its next run; None if `vehicle.memory` asks for none.
 
     Raises:
         CommandError: the file cannot be written, or another process uses it.
@@ -299,9 +299,9 @@ def _memory(
 def _saving(
     memory: "MemoryFile", scenario: Scenario, number: int, warnings: list[Event]
 ) -> Callable[..., Client]:
-    """Function that makes a client, which continues from an earlier run's state, and saves its own.
+    """Function that makes a client that saves its state, and continues from an earlier run's state.
 
-    A warning for the log is added to `warnings`.
+    A warning is added to `warnings` if a saved state was used, or could not be used.
     """
     room = load("skytether.client.memory", "vehicle.memory")
     before: SavedState | None = None

@@ -1,6 +1,6 @@
-"""A client with one server, which its vehicle follows, and without saved state.
+"""Parts of a client whose vehicle follows a single server, and that saves no state.
 
-Other modules replace its parts: `client.standby` with a standby server, `client.several` with
+Other modules replace these parts: `client.standby` with a standby server, `client.several` with
 several addresses. `client.memory` has a client whose next run continues in the middle of a flight.
 """
 
@@ -20,9 +20,9 @@ class MotionInForce(NamedTuple):
     """Motion of a mission that a vehicle flies."""
 
     step: int
-    """Step that the plan was made for."""
+    """Step of the first knot."""
     observed: int
-    """Step of the observation that the plan was made from."""
+    """Step of the observation from which the motion was planned."""
     since: int
     """First step whose input was computed from the motion."""
     spacing: int
@@ -39,7 +39,7 @@ class Fresh:
     motion: Any = None
 
     def servers(self, parts: "Parts") -> "OneServer":
-        """Servers of a client that has a single server and no saved state."""
+        """The single server of a client without saved state."""
         return OneServer(parts.failsafe)
 
 
@@ -66,20 +66,20 @@ class Role:
         """Function that passes a cause (`Reason`) that concerns the server to the failsafe."""
 
     def begin(self) -> None:
-        """Note another session with the server."""
+        """Note that a new session with the server begins."""
 
     def check_plan(self) -> None:
         """Raise ProtocolError if the plan that was decoded last must not be flown."""
 
     def take(self, message: Message, now_ns: int) -> bool:
-        """Process a message about leadership; False if it is another message."""
+        """Process a message about leadership; False if the message is about something else."""
         return False
 
     def lost_after_ns(self, timeout_ns: int) -> int:
         """Silence after which the server counts as lost [ns].
 
         Args:
-            timeout_ns: value for a server that the vehicle follows [ns].
+            timeout_ns: silence after which a server that the vehicle follows counts as lost [ns].
         """
         return timeout_ns
 
@@ -97,7 +97,7 @@ class OneServer:
     def __init__(self, failsafe: Failsafe) -> None:
         self.failsafe = failsafe
         self.sessions: list[Any] = []
-        """Session with each server; the caller appends the sessions."""
+        """Session with each server, appended by the caller."""
         self.may_tell: Callable[[int], bool] = lambda _: True
         """Whether messages may be sent at a time [ns]; replaced if the client saves its state."""
 
@@ -121,7 +121,7 @@ class OneServer:
         """Act on an operator's change of `keys`."""
 
     def to_keep(self) -> dict[str, Any]:
-        """Values of the servers for fields of `memory.SavedState`."""
+        """Fields of `memory.SavedState` that the servers provide: value by name."""
         return {}
 
     def figures(self) -> dict[str, Any]:
@@ -139,14 +139,14 @@ class Parts(NamedTuple):
     before: Any
     """State saved by the previous run: `memory.SavedState`, or `Fresh`."""
     motion: Callable[[], MotionInForce | None]
-    """Function that returns the motion of a mission in force; None on the ground or without one."""
+    """Function that returns a mission's motion in force; None on the ground or without a motion."""
     out: list[Datagram]
     events: Events
     """List to which events for the operator are appended."""
 
 
 class Reach:
-    """Routes and links from a vehicle to its servers; in this base class one server, one address.
+    """Routes and links from a vehicle to its servers; this class has one server at one address.
 
     Args:
         server: address of the server, or of the netem in front of it.
@@ -163,7 +163,7 @@ class Reach:
         return [Route((self._server,), (0,), parts.out)]
 
     def servers(self, parts: Parts) -> OneServer:
-        """Servers, without their sessions.
+        """Servers of the vehicle; the caller adds their sessions.
 
         Raises:
             ConfigError: the scenario is not suited for these servers.

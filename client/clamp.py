@@ -1,8 +1,8 @@
-"""Last bound on all inputs, independent of the part of the client that chose them.
+"""Last bound on every input, independent of the part of the client that chose the input.
 
-It shares no code with packet decoding or the choice of the input, so that it also stops errors
-there. Only the fence acts after it: an input that leads back inside may change faster than this
-bound allows.
+It shares no code with packet decoding or the choice of the input, so an error there does not
+disable it. Only the fence acts after it, because an input that leads back inside the fence may have
+to change faster than this bound allows.
 """
 
 import math
@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Protocol
 
 ROUNDING = 1e-9
-"""Excess of speed attributed to rounding [m/s]."""
+"""Excess over the largest speed that counts as a rounding error [m/s]."""
 
 
 class Guard(Protocol):
@@ -60,7 +60,7 @@ def clamped(
     flown = []
     for u, part, last, most in zip(wanted, without_feedback, before, u_max, strict=True):
         near = min(max(u - excess * part, last - change_max), last + change_max)
-        # The bound comes last and so always holds. `before` is within it, so the largest change
-        # holds too.
+        # The bound u_max is applied last, so it always holds. `before` is within u_max, so the
+        # bound of the change still holds, too.
         flown.append(min(max(near, -most), most))
     return flown

@@ -11,8 +11,8 @@ offset and drift. Any two answers bound the drift:
                                              / (t₂ - t₁)
 
 In the first seconds, when a fit would follow the noise, the drift of smallest magnitude within
-these bounds is used. The line is then shifted until no answer contradicts it: each answer bounds
-the offset at its time, and since then the clocks have drifted within the bounds.
+these bounds is used. The line is then shifted until it agrees with every answer: an answer bounds
+the offset at its time, and with the bounds of the drift also the present offset.
 """
 
 from collections import deque
@@ -29,7 +29,7 @@ ASKED_MAX = 16
 ROUND_TRIP_MAX_NS = SECOND_NS
 """Longest round trip of an answer that is used, for an autopilot aboard."""
 SPREAD_NS = MILLISECOND_NS
-"""Part of the largest usable round trip, which is 1.5 times the shortest, plus SPREAD_NS."""
+"""Constant part of the largest usable round trip: 1.5 times the shortest one plus SPREAD_NS."""
 DRIFT_SPAN_NS = 10 * SECOND_NS
 """Shortest time span of the answers from which the drift is fitted."""
 DRIFT_MAX = 0.02
@@ -61,7 +61,7 @@ class BootClock:
         self._questions: deque[int] = deque(maxlen=ASKED_MAX)
         self._samples: deque[Sample] = deque(maxlen=WINDOW)
         self._taken = 0
-        """Number of answers used since the clock was started."""
+        """Number of answers used since the clock began or last jumped."""
         self._deviating: list[Sample] = []
         self._line = (0, 0.0, 0.0)
         """Reference time [ns; the client's clock], offset at that time [ns], and drift."""
@@ -84,12 +84,12 @@ class BootClock:
 
     @property
     def wrong_rate(self) -> float | None:
-        """Rate of the autopilot's clock relative to the client's; None if normal."""
+        """Rate of the autopilot's clock relative to the client's; None if close to 1 or unknown."""
         if len(self._answers) < KNOWN:
             return None
         (local_ns, boot_ns), (local_after_ns, boot_after_ns) = self._answers[0], self._answers[-1]
         passed_ns, boot_passed_ns = local_after_ns - local_ns, boot_after_ns - boot_ns
-        # Sum of the error bounds of two answers; a reboot (negative time) is not a wrong rate.
+        # Sum of the errors of both answers. Negative time means a reboot, not a wrong rate.
         error_ns = 2 * (self.round_trip_ns or 0) + SPREAD_NS
         if (
             boot_passed_ns <= 0
@@ -142,7 +142,7 @@ class BootClock:
         return True
 
     def _fit(self) -> None:
-        """Fit a line to the answers with short round trips, consistent with the newest of them."""
+        """Fit a line to the quick answers that agree with the newest quick answer."""
         least = min(sample.round_trip_ns for sample in self._samples)
         most = least + least // 2 + SPREAD_NS
         quick = [sample for sample in self._samples if sample.round_trip_ns <= most]
@@ -180,19 +180,19 @@ class BootClock:
         return offset_ns + drift * (local_ns - origin_ns)
 
     def local_ns(self, boot_ns: int) -> int:
-        """Client's time at a time since boot; needs `is_known`."""
+        """Time on the client's clock at a time since boot [ns]; needs `is_known`."""
         origin_ns, offset_ns, drift = self._line
         # local = boot + offset + drift * (local - origin), solved for local
         since_ns = boot_ns + int(offset_ns) - origin_ns
         return origin_ns + round(since_ns / (1.0 - drift))
 
     def boot_ns(self, local_ns: int) -> int:
-        """Time since boot at a time of the client's clock; needs `is_known`."""
+        """Time since boot at a time on the client's clock [ns]; needs `is_known`."""
         return local_ns - round(self._offset(local_ns))
 
 
 def _agreeing(samples: list[Sample]) -> tuple[list[Sample], float, float]:
-    """Newest answers that are consistent, and the smallest and largest drift that they allow.
+    """Newest answers that agree with one another, and the smallest and largest drift they allow.
 
     Older answers date from before the drift changed, or before the clock stood still for a while.
     """

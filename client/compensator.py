@@ -1,8 +1,8 @@
-"""Uplink delay compensator, eq. (11): the input of the present step, from a horizon made earlier.
+"""Uplink delay compensator, eq. (11): the input of the present step, from a plan made earlier.
 
-Of all horizons that arrived, the one made for the latest step is in force (E11). `client.followers`
-computes the input from it. Without a horizon the vehicle brakes from the last input, or hovers if
-it stands still.
+Of all plans that arrived, the plan made for the latest step is in force (E11). `client.followers`
+computes the input from this plan. Without a plan the vehicle brakes from the last input, or hovers
+if it stands still.
 """
 
 from typing import TYPE_CHECKING
@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from skytether.client.horizons import Horizons
 
 UNENDING = 2**30
-"""Number of stages for which a position is held: practically infinite."""
+"""Number of steps for which a position is held: practically infinite."""
 
 
 class Compensator:
-    """Keeps the newest horizon and computes the input of any step from it.
+    """Keeps the newest plan, and computes the input of each step from this plan.
 
     Args:
         regulator: K and λ of the feedback along a spline, see `shared.scenario.gain.regulator`;
@@ -44,43 +44,43 @@ class Compensator:
             horizons = load("skytether.client.horizons", f"control.scheme {terms.scheme}")
             self._horizons = horizons.Horizons(self._constants)
         self.begins = 0
-        """Step of stage 0: that for which the horizon was made, or at which it was dropped."""
+        """Step of stage 0: the step that the plan was made for, or at which it was dropped."""
         self.follower: Follower = self._braking(np.zeros(terms.axes))
-        """Follower of the horizon in force; without a horizon, of the braking curve."""
+        """Follower of the plan in force; without a plan, braking or holding a position."""
         self._chosen = 0
         self.in_force = NO_HORIZON
-        """Step that the horizon in force was made for, or NO_HORIZON."""
+        """Step that the plan in force was made for, or NO_HORIZON."""
         self.newest = NO_HORIZON
-        """Step that the newest horizon was made for, including horizons dropped since."""
+        """Step that the newest plan was made for, even if that plan was dropped since."""
         self.since = 0
-        """First step whose input came from the horizon in force."""
+        """First step whose input came from the plan in force."""
         self._new = False
         self.observed = -1
         self.covered = False
-        """Whether the horizon in force has an input for the latest chosen step."""
+        """Whether the plan in force has an input for the step of the latest call of `choose`."""
         self.stale = 0
-        """Number of horizons that arrived after a newer horizon or a second time."""
+        """Number of plans that arrived after a newer plan, or for a second time."""
         self.repeated = 0
-        """Number of times that the horizon in force arrived again, because the server did not know
+        """Number of times that the plan in force arrived again, because the server did not know
         that it had arrived."""
 
     def offer(self, horizon: Horizon | Trajectory, step: int, observed: int) -> bool:
-        """Put a horizon in force unless a newer one has arrived; return whether it is in force now.
+        """Put a plan in force unless a newer plan has arrived; return whether it is in force now.
 
         Args:
-            horizon: horizon received.
+            horizon: plan received.
             step: k, the next step whose input is chosen.
-            observed: step of the observation that the horizon was planned from.
+            observed: step of the observation from which the plan was computed.
 
         Raises:
-            ProtocolError: the horizon is too far in the future; its observation is in the
-                future, or too old for any input; it arrived after its last input was due, or too
-                long after its committed inputs, so that other inputs were flown; or it is a
-                mission's motion whose first knot is in the future.
+            ProtocolError: the plan is too far in the future; its observation is in the future, or
+                too old for any input; the plan arrived after its last input was due, or so long
+                after its committed inputs that other inputs were flown; or the plan is a mission's
+                motion whose first knot is in the future.
         """
         if horizon.step > step + self._H:
             raise ProtocolError(Drop.FROM_THE_FUTURE)
-        # The horizon made for the latest step is flown, in any order of arrival (E11).
+        # The plan made for the latest step is flown, whatever the order of arrival (E11).
         if horizon.step <= self.newest:
             self.stale += 1
             self.repeated += horizon.step == self.in_force
@@ -117,14 +117,14 @@ class Compensator:
         *,
         since: int | None = None,
     ) -> None:
-        """Put a spline in force: a new spline, or one accepted by an earlier run of this client.
+        """Put a spline in force, newly received or accepted by an earlier run of this client.
 
         Args:
             made_for: step of the first knot.
             observed: step of the observation that the spline was planned from.
             spacing: steps from one knot to the next.
             knots: position [m] and velocity [m/s] of each knot; shape (axes, knots, 2).
-            since: first step whose input came from the spline, in the earlier run.
+            since: first step whose input came from the spline in the earlier run; None: new spline.
         """
         self._put_in_force(made_for, observed)
         if since is not None:
@@ -142,19 +142,17 @@ class Compensator:
         self.observed = observed
 
     def drop(self, step: int, flown_last: Array) -> None:
-        """Drop the horizon and brake from `flown_last`, the input of `step` [m/s]. Calling it again
-        changes nothing.
-        """
+        """Drop the plan, and brake from `flown_last`, the input of `step` [m/s]."""
         self.in_force, self.observed = NO_HORIZON, -1
         self._new = self.covered = False
         self.begins, self.follower = step, self._braking(flown_last)
 
     def _braking(self, flown: Array) -> HorizonFollower:
-        """Ended horizon with the single input `flown`, from which the rule of flight brakes."""
+        """Follower that brakes from the input `flown`: a horizon that ends after this one input."""
         return HorizonFollower(self._constants, flown[:, None], 1)
 
     def rest(self, step: int, state: Array) -> None:
-        """Hold the present position until a horizon arrives or `drop` is called.
+        """Hold the present position until a plan arrives or `drop` is called.
 
         Args:
             step: k, the next step whose input is chosen.
@@ -177,13 +175,13 @@ class Compensator:
         return self.in_force == NO_HORIZON and isinstance(self.follower, SplineFollower)
 
     def _comes_too_late(self, horizon: Horizon | Trajectory, stage: int, length: int) -> bool:
-        """Whether a horizon arrives too late to be flown.
+        """Whether a plan arrives too late to be flown.
 
         Args:
-            stage: stage of the horizon at the present step.
+            stage: stage of the plan at the present step.
             length: number of its stages that may be flown.
         """
-        if self._brake and stage >= length:  # it would only start the braking again
+        if self._brake and stage >= length:  # a plan that has ended would only restart the braking
             return True
         if self._horizons is None or isinstance(horizon, Trajectory):
             return False
@@ -209,9 +207,9 @@ class Compensator:
         return flown, without_feedback
 
     def flown_since(self, step: int) -> int:
-        """First step whose input comes from the horizon in force, where `step` is the next step."""
+        """First step whose input comes from the plan in force, given the next step, `step`."""
         return step if self._new else self.since
 
     def foresee(self, states: Array, flown: Array | None = None) -> Array:
-        """State of each axis one step after the latest chosen step, see `Follower.foresee`."""
+        """State of each axis one step after the latest call of `choose`, see `Follower.foresee`."""
         return self.follower.foresee(self._chosen - self.begins, states, flown)

@@ -1,9 +1,9 @@
-"""The client as an endpoint: one vehicle that flies, reports its state and receives at every step.
+"""The client as an endpoint: one vehicle that receives plans, flies, and reports its state.
 
 It combines `session` (the conversation with a server, made by `connections`), `pilot` (which flies
 the vehicle) and `failsafe` (which decides what the vehicle may do). `ground` and `flight_log`
 report what happens, and `orders` takes the orders of an operator. The flight runs on the client's
-own clock, so losing the server does not shift its steps.
+own clock, so the steps go on in time without a server.
 """
 
 from collections import Counter
@@ -46,13 +46,13 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import CLOSES, Close, Mode, stamp_us
 
 ORDERS = keys_of(InFlight.ARMED) | {*DECISIONS}
-"""Keys of an operator's orders to any vehicle, see `orders`."""
+"""Keys of the scenario that an operator can change in flight for every vehicle, see `orders`."""
 VEHICLE_SOCKET = 1
-"""Socket used by the vehicle's own port; the server's is 0."""
+"""Number of the socket of the vehicle's own port; socket 0 leads to the server."""
 LATEST_NS = SECOND_NS
-"""Longest time for which a client that was asked to end continues after its motion [ns]."""
+"""Longest time from the end of the motion to the end of a client that was asked to end [ns]."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
-"""Interval between two reports of the time of day [ns], and the largest error that fits in one
+"""Interval between two TIME messages [ns], and largest error of the time of day that fits in one
 [µs]."""
 
 
@@ -70,7 +70,7 @@ class Client(Endpoint):
     """
 
     _unsaved = False
-    """Whether the client has failed to save its state; observations report it."""
+    """Whether saving the client's state has failed; observations report this failure."""
 
     def __init__(
         self,
@@ -186,7 +186,7 @@ class Client(Endpoint):
             horizon = session.hear(datagram.payload, path=path, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
-            elif self._failsafe.mode is Mode.INIT:  # an earlier run's flight gets a session
+            elif self._failsafe.mode is Mode.INIT:  # the flight of an earlier run now has a session
                 self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
             elif horizon is not None:
                 self._pilot.offer(horizon, now_ns=now_ns)
@@ -362,7 +362,7 @@ class Client(Endpoint):
                     session.send(Close(self.vehicle, session.number), now_ns=now_ns)
 
     def _note_transitions(self, now_ns: int) -> None:
-        """Let the pilot act on the transitions of the failsafe, and report them."""
+        """Let the pilot act on the failsafe's changes of mode, and log these changes."""
         self._pilot.obey()
         if any(each.cause in CLOSING for each in self._pilot.transitions):
             self._session.close()

@@ -4,9 +4,8 @@
 
 `TRANSITIONS` maps mode and cause to the next mode; a pair that is missing changes nothing. `HOLD`
 is the table without a failsafe, for a vehicle that repeats its last input for ever, like the
-paper's.
-`Failsafe` detects the causes that take time: a good link, silence, late horizons, repeated errors.
-`client.pilot` chooses the input in each mode.
+paper's. `Failsafe` detects the causes that need a timer: a good link, silence, late plans, repeated
+errors. `client.pilot` chooses the input in each mode.
 """
 
 import math
@@ -21,26 +20,25 @@ from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
 GOOD_NS = SECOND_NS
-"""Time for which the link has to be good before horizons are accepted."""
+"""Time for which the link has to be good before plans are accepted."""
 STALL_NS = 100 * MILLISECOND_NS
-"""Lateness of a step above which the present plan counts as too old, for any cause."""
+"""Lateness of a step above which the present plan counts as too old, whatever the cause."""
 LATE_NS = 500 * MILLISECOND_NS
-"""Time for which all horizons have to arrive late before the vehicle brakes."""
+"""Time for which all plans have to arrive late before the vehicle brakes."""
 LATE_SHARE = 0.75
-"""Share of a horizon's planned inputs that must have passed at its arrival for it to count as
-late."""
+"""A plan counts as late if more than this share of its planned inputs has passed when it
+arrives."""
 WINDOW_NS = SECOND_NS
 """Window in which errors of the server are counted."""
 MALFORMED_MAX = 5
 """Number of malformed messages within `WINDOW_NS` that make the vehicle brake."""
 FUTURE_MAX = 10
-"""Number of horizons from the future within `WINDOW_NS` after which the client opens a new
-session."""
+"""Number of plans from the future within `WINDOW_NS` after which the client opens a new session."""
 BRAKE_SPARE_NS = 500 * MILLISECOND_NS
-"""Margin added to the time that braking takes."""
+"""Margin added to the computed time of braking."""
 
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
-"""Causes after which a pilot flies the vehicle, or nobody because it is disarmed."""
+"""Causes after which the client flies no longer: a pilot took over, or the motors are disarmed."""
 GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED})
 BROKEN = frozenset(
     {
@@ -55,12 +53,11 @@ BROKEN = frozenset(
 )
 """Causes after which the link has to be good for `GOOD_NS` again, in every mode."""
 LOCKING = BROKEN | GROUNDING | YIELDING | {Reason.LATE, Reason.RETURNED}
-"""Causes of braking after which horizons are refused until the vehicle hovers and the link is
-good."""
+"""Causes of braking after which plans are refused until the vehicle hovers and the link is good."""
 CLOSING = frozenset({Reason.CLOSED, Reason.RESYNC})
 """Causes that end the session, so that another WELCOME is needed."""
 DROPPING = LOCKING | {Reason.STALLED, Reason.NOT_FINITE, Reason.UNARMED, Reason.LEAPT}
-"""Causes that drop the horizon in force."""
+"""Causes that drop the plan in force."""
 
 AT_ONCE = YIELDING | {
     Reason.NOT_FINITE,
@@ -77,12 +74,12 @@ a person intervenes. Every other cause waits for the last knot, see `Failsafe.me
 
 HANGING = frozenset({Mode.SYNC, Mode.READY, Mode.HOVER})
 FOLLOWING = frozenset({Mode.TRACK, Mode.COAST})
-"""Modes in which a horizon or a motion is flown."""
+"""Modes in which a plan is flown."""
 KEPT = frozenset({Reason.BRAKED, Reason.WAITED})
 """Causes that do not replace the reason for braking or hovering."""
 
 CALM = frozenset({Mode.TRACK, Mode.COAST, Mode.HOVER})
-"""Modes in which a vehicle may fly for many steps without a change of mode."""
+"""Modes that may last for many steps while the vehicle is in the air."""
 
 Table = Mapping[tuple[Mode, Reason], Mode]
 
@@ -90,8 +87,8 @@ _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not
 _TO_BRAKE = (
     BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
 )
-# From all modes but INIT, in which nothing is flown yet, and LAND, RETURN and FAULT, which only an
-# operator ends.
+# Not from INIT, in which the client flies nothing yet, nor from LAND, RETURN and FAULT, which only
+# a restart ends.
 _YIELDS = {
     (mode, cause): Mode.MANUAL
     for mode in Mode
@@ -127,7 +124,7 @@ TRANSITIONS: Table = MappingProxyType(
     }
     | {(mode, cause): Mode.LAND for mode in HANGING for cause in (Reason.ALONE, Reason.WAITED)}
     | {(mode, Reason.HOMEWARD): Mode.RETURN for mode in HANGING}
-    # Without LOST: in SYNC the vehicle waits for a link in any case.
+    # LOST is missing, because in SYNC the vehicle waits for a link in any case.
     | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
     | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
     | {(Mode.TRACK, cause): Mode.BRAKE for cause in _TO_BRAKE}
@@ -175,7 +172,7 @@ class Transition(NamedTuple):
     cause: Reason
     """Cause of the change; a cause in `KEPT` does not become the reason."""
     takes: bool
-    """Whether horizons are accepted from now on."""
+    """Whether plans are accepted from now on."""
 
 
 class Failsafe:
@@ -183,13 +180,13 @@ class Failsafe:
 
     Args:
         table: `TRANSITIONS` or `HOLD`.
-        armed: whether horizons may be flown at all.
-        timeout_ns: time of silence after which the link counts as lost, and time without a
-            newer horizon after which the vehicle coasts [ns].
+        armed: whether plans may be flown at all.
+        timeout_ns: time of silence after which the link counts as lost, and time without a newer
+            plan after which the vehicle coasts [ns].
         brake_ns: longest time of braking, after which the vehicle hovers even if wind still
             pushes it [ns].
-        land_after_ns: time of hovering after which the vehicle lands if, for example, the link
-            does not become good again [ns]; 0: never.
+        land_after_ns: time for which a hovering vehicle waits for a good link, a ready autopilot or
+            an operator before it lands [ns]; 0: without end.
         returns: whether the vehicle returns home instead of landing if the server is silent.
     """
 
@@ -205,7 +202,7 @@ class Failsafe:
     ) -> None:
         self._table = table
         self.brakes = table is TRANSITIONS
-        """Whether the vehicle brakes without a plan, rather than repeating its last input."""
+        """Whether the vehicle brakes when it has no plan, instead of repeating its last input."""
         self.armed = armed
         self._timeout_ns, self._brake_ns = timeout_ns, brake_ns
         self._land_after_ns = land_after_ns
@@ -219,25 +216,25 @@ class Failsafe:
         """Newest cause that changed mode or reason; while hovering, why the vehicle braked."""
         self._heard_ns: int | None = None
         self._good_ns = 0
-        """Start of the present time with a good link; only valid while the link is good."""
+        """Time at which the link became good; valid only while the link is good."""
         self._horizon_ns = 0
         self._late_ns: int | None = None
-        """Time since which all horizons have been late; None if the newest was in time."""
+        """Time since which all plans have been late; None if the newest plan was in time."""
         self._began_ns = 0
         self._waits_ns = 0
         """Start of the wait for a good link, a ready autopilot or an operator."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
         self.has_leapt = False
-        """Whether the measured state has leapt and the operator has not yet chosen a frame."""
+        """Whether the measured state has leapt, and the operator has not decided yet."""
         self.stays = False
-        """Whether the vehicle hovers on after a leap instead of landing, as chosen by the
-        operator."""
+        """Whether an operator has chosen that the vehicle hovers on after a leap instead of
+        landing."""
         self._future: deque[int] = deque(maxlen=FUTURE_MAX)
-        """Times of the newest horizons from the future."""
+        """Times at which the newest plans from the future arrived."""
         self.keeps_motion = False
         """Whether a mission's motion is in force and its last knot is still ahead."""
         self.postponed: Reason | None = None
-        """First cause that waits for the last knot of the motion in force; None if none waits."""
+        """First cause that takes effect only at the last knot of the motion in force, or None."""
 
     @property
     def heard_ns(self) -> int | None:
@@ -245,10 +242,10 @@ class Failsafe:
 
     @property
     def takes(self) -> bool:
-        """Whether a horizon that arrives now is flown."""
+        """Whether a plan that arrives now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
-        # After a stall a newer motion is better; after any other cause the server that sent it is
-        # unreliable.
+        # After a stall a newer motion is better than the old one. After any other cause the server
+        # that sent the newer motion is unreliable.
         may = may and self.postponed in (None, Reason.STALLED)
         return may and self.armed and not self.has_leapt and self.reason not in LOCKING
 
@@ -283,8 +280,8 @@ class Failsafe:
         self.meet(cause, now_ns=now_ns)
 
     def horizon_arrived(self, *, late: bool, now_ns: int) -> None:
-        """Note a horizon newer than all before, whether accepted or not; `late` if more than
-        LATE_SHARE of it has passed.
+        """Note a plan newer than all before, accepted or not; `late`: more than LATE_SHARE of the
+        plan has passed.
         """
         if not late:
             self._late_ns = None
@@ -295,7 +292,7 @@ class Failsafe:
 
     def horizon_taken(self, *, now_ns: int) -> None:
         self._horizon_ns = now_ns
-        self.postponed = None  # was None or STALLED, see `takes`: the newer motion is in time
+        self.postponed = None  # a postponed STALLED ends: the newer motion is in time
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
@@ -304,7 +301,7 @@ class Failsafe:
             self.meet(Reason.MALFORMED, now_ns=now_ns)
 
     def future(self, *, now_ns: int) -> None:
-        """Note a horizon made for a step in the future, or from an observation in the future."""
+        """Note a plan made for a step in the future, or from an observation in the future."""
         if _full(self._future, now_ns):
             self.meet(Reason.RESYNC, now_ns=now_ns)
 
@@ -317,7 +314,7 @@ class Failsafe:
             late_ns: delay with which the step was started [ns].
             hindrance: cause on the vehicle's side that forbids following a plan.
         """
-        # Hindrances first: when a pilot takes over, no check below may act before that.
+        # The hindrance first: when a pilot takes over, no later check may act before that.
         if hindrance is not None:
             self.meet(hindrance, now_ns=now_ns)
         elif self.mode is Mode.MANUAL:
@@ -359,8 +356,8 @@ class Failsafe:
             self.meet(self._alone if lost else Reason.WAITED, now_ns=now_ns)
 
     def leapt(self, *, now_ns: int) -> None:
-        """Note a leap of the state: no horizon is accepted until an operator
-        has chosen the frame.
+        """Note a leap of the state: no plan is accepted until an operator has decided which
+        position is right.
         """
         # With HOLD there is no failsafe, and a leap has no effect.
         self.has_leapt = self.brakes
@@ -371,8 +368,8 @@ class Failsafe:
         self.has_leapt = self.stays = False
 
     def motion_goes_on(self, goes_on: bool, *, now_ns: int) -> None:
-        """Note at each step whether a mission's motion is in force and its last knot still ahead;
-        at the last knot the postponed cause acts.
+        """Note whether a mission's motion is in force and its last knot still ahead (`goes_on`). At
+        the last knot the postponed cause takes effect.
         """
         self.keeps_motion = goes_on
         if not goes_on and self.postponed is not None:
@@ -383,8 +380,8 @@ class Failsafe:
         """Act on a cause: change mode and reason by the transition table.
 
         The other vehicles of a mission avoid the motion in force and assume no other. So a faulty
-        or missing packet does not end the motion: such a cause acts at the last knot, where the
-        vehicle rests, and until then no other motion is accepted.
+        or missing packet does not end the motion: such a cause takes effect at the last knot, where
+        the vehicle rests, and until then no other motion is accepted.
         """
         after = self._table.get((self.mode, cause))
         if after is None:
@@ -409,7 +406,7 @@ class Failsafe:
 
 
 def _full(times_ns: deque[int], now_ns: int) -> bool:
-    """Add a time. Return whether the queue is full of times within WINDOW_NS; if so, empty it."""
+    """Add a time; return whether the queue is full of times within WINDOW_NS, and then empty it."""
     times_ns.append(now_ns)
     full = len(times_ns) == times_ns.maxlen and now_ns - times_ns[0] <= WINDOW_NS
     if full:

@@ -6,8 +6,8 @@ input drifts on to
 
     s = p + τ v                 and with the input u, by eq. (1):   ṡ = g u + w
 
-So s is where the vehicle would come to rest, and inputs move s as if there was no inertia. At the
-distance y = bound - s, the speed towards the bound is limited to
+So s is where the vehicle would come to rest, and inputs move s as if there were no inertia. At the
+distance y = bound - s, the speed of s towards the bound is limited to
 
     φ(y) = y / T                   for y ≤ b T²; negative y gives a negative speed, back inside
            √(2 b (y - b T² / 2))   beyond: from this speed it can still stop with deceleration b
@@ -19,8 +19,8 @@ The bounds are moved inwards by
 
 where W [m/s] is the wind in which the fence must hold: wind pushes the vehicle beyond the point to
 which the input leads. The factor 1.25 covers a gain of 0.8; 0.1 s covers an error in the dead time
-θ; Δt covers wind that changes before the next input. Tests check this with time constants wrong by
-30 %, gains by 20 % and dead times by 0.1 s.
+θ; Δt covers wind that changes before the next input. Tests check that the fence holds with time
+constants wrong by 30 %, gains by 20 % and dead times by 0.1 s.
 """
 
 import math
@@ -45,14 +45,14 @@ class Fence:
         self._bounds = list(zip(low, high, strict=True))
         self._home: list[float] | None = None
         self.holds = False
-        """Whether a bound limited the latest requested input; a bound on the speed alone does not
+        """Whether a bound on the position limited the latest input; a limit on its speed does not
         count."""
 
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
     ) -> list[float]:
         """See `client.clamp.Guard`."""
-        # Home is the first known state: a real vehicle need not stand at the scenario's start.
+        # Home is the first known position: a real vehicle need not stand at the scenario's start.
         self._home = self._home or [p for p, _ in state]
         rest = [p + tau * v for (p, v), tau in zip(state, self._tau, strict=True)]
         flown = self._inside(wanted, rest, u_max)
@@ -95,10 +95,10 @@ class Fence:
 
 
 def _slowed(back: Sequence[float], flown: Sequence[float], speed: float) -> list[float]:
-    """Fastest input within `speed` on the line between an input that leads back and one that is too
-    fast.
+    """Input with the magnitude `speed`, between an input that leads back (`back`) and one that is
+    too fast (`flown`).
 
-    Both inputs are allowed, and the allowed region is convex, so all inputs between them are, too.
+    The bounds allow both inputs and are convex, so they allow all inputs between these two.
     """
     most = math.hypot(*back)
     if most >= speed:

@@ -1,7 +1,7 @@
 """Kalman filter aboard: position and velocity from noisy measurements.
 
 Each axis has the state x = [p, v, w]: position [m], velocity [m/s], and a disturbance that acts
-like an additional input [m/s], as steady wind or a wrong gain does. The inputs u are known exactly:
+like an additional input [m/s], such as steady wind or a wrong gain. The inputs u are known exactly:
 
     p, v follow eq. (4) with the input u + w              w(k+1) = w(k)
     P(k+1) = F P(k) Fᵀ + Q                                F: eq. (4) of [p, v, w]
@@ -11,9 +11,9 @@ random walk of w. Measurements are processed one number at a time, z = h x + noi
 
     K = P hᵀ / (h P hᵀ + r)        x ← x + K (z - h x)        P ← P - K h P
 
-so a missing number is simply skipped. A delayed measurement describes the step at which it was
-made: the filter's state is kept at that step, and the estimate is this state predicted to the
-present with the inputs since. A constant sensor error cannot be detected.
+so a missing number is simply skipped. If measurements arrive late, the filter's state is that of
+the step at which they were made, and the estimate is this state predicted to the present with the
+inputs flown since. A constant sensor error cannot be detected.
 
 The covariance P does not depend on the measured values.
 """
@@ -30,9 +30,9 @@ from skytether.shared.scenario import rooms
 from skytether.shared.scenario.schema import Scenario
 
 DRIFT = 0.3
-"""Random walk of w relative to q: w moves by DRIFT q √t in the time t."""
+"""Strength of the random walk of w relative to q: in the time t, w moves by DRIFT q √t (RMS)."""
 BEGIN_MPS = 1.0, 0.5
-"""Initial standard deviation of a velocity that was not measured, and of w [m/s]."""
+"""Initial standard deviations of the velocity, if it was not measured, and of w [m/s]."""
 # A variance of 0 would make the covariance singular.
 LEAST = 1e-6
 """Smallest standard deviation assumed for a measurement [m], [m/s]."""
@@ -72,7 +72,7 @@ def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
     pp, pv, pw, vv, vw, ww = P
     total = pp + variance
     kp, kv, kw = pp / total, pv / total, pw / total
-    # (1 - K) P computed as variance / total · P: 1 - K loses digits if the sensor is good.
+    # 1 - K is computed as variance / total: the difference loses digits if K is near 1.
     share = variance / total
     return (kp, kv, kw), Spread(
         share * pp, share * pv, share * pw, vv - kv * pv, vw - kv * pw, ww - kw * pw
@@ -98,7 +98,7 @@ def advanced(x: Table, P: Table, model: Table, noise: Table, inputs: Numbers) ->
         P: covariance of each axis, rows of `Spread`.
         model: rows of `Axis`.
         noise: Q of each axis, rows of `Spread`.
-        inputs: input that acts, of each axis [m/s].
+        inputs: input that acts during the step, of each axis [m/s].
     """
     for i in range(len(x)):
         axis = Axis(model[i, 0], model[i, 1], model[i, 2], model[i, 3])
@@ -146,9 +146,7 @@ def _write(table: Table, i: int, spread: Spread) -> None:
 
 
 class Kalman:
-    """Kalman filter of a scenario's vehicle; `delay` is the age of a measurement when it arrives
-    [steps].
-    """
+    """Kalman filter of a scenario's vehicle; a measurement arrives `delay` steps late."""
 
     def __init__(self, scenario: Scenario, delay: int) -> None:
         terms, sensor = scenario.terms(), scenario.sensor
@@ -177,7 +175,7 @@ class Kalman:
             self._late[:] = [each.late for each in rooms.dead_time().dead_times(terms)]
 
     def begin(self, measured: Measurement, numbers: Array) -> None:
-        """Start from the first measurement, which has a position; the vehicle is at rest.
+        """Start from the first measurement, which must have a position; the vehicle is at rest.
 
         Args:
             measured: the measurement.
@@ -192,12 +190,11 @@ class Kalman:
         self.P[:] = Spread(self._variances[0], 0.0, 0.0, v * v, 0.0, w * w)
 
     def advance(self, due: Array, swing: Array | None = None) -> None:
-        """Advance by a step over which these inputs act, see `shared.law.dead_time`.
+        """Advance by a step; a dead time may split it between two inputs (`shared.law.dead_time`).
 
         Args:
             due: input acting at the end of the step, of each axis [m/s].
-            swing: difference to the input acting at the start of the step [m/s]; None if there
-                is none.
+            swing: input acting at the start of the step minus `due` [m/s]; None without a change.
         """
         self._acted.append((due, swing))
         inputs, more = self._acted.popleft()

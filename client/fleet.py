@@ -11,9 +11,7 @@ from skytether.shared.scenario.schema import Scenario
 
 
 class ClientFleet(Endpoint):
-    """Clients driven as one endpoint; client n uses socket n. No client may
-    have been woken before.
-    """
+    """Clients driven as one endpoint; client n uses socket n. No client may have been woken yet."""
 
     def __init__(self, clients: Sequence[Client], apart_ns: int = 0) -> None:
         super().__init__()
@@ -23,7 +21,7 @@ class ClientFleet(Endpoint):
         self.changeable = clients[0].changeable
         self._due_ns = [client.next_wake_ns() for client in clients]
         self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns) if due_ns is not None]
-        """Wakes requested by clients: time and client. An outdated entry stays until its time."""
+        """Requested wakes: time [ns] and client number. Outdated entries stay until their time."""
         heapify(self._heap)
         self._flying = set(range(len(clients)))
 

@@ -24,7 +24,7 @@ from skytether.shared.telemetry.record import Reason
 HELD_AGAIN_NS = 5 * SECOND_NS
 """Time after which the log repeats that the fence limits the vehicle."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
-"""Reasons for a mode that do not explain why there is no newer horizon."""
+"""Reasons of a mode that leave open why no newer plan has arrived; the log then names the cause."""
 
 
 class FlightLog:
@@ -47,15 +47,15 @@ class FlightLog:
         self._fence_report_ns = 0
         """Time before which the fence is not reported again."""
         self._latest_ns = 0
-        """Largest lateness of a step so far."""
+        """Largest lateness of a step so far [ns]."""
         self._reported_leap: tuple[float, ...] | None = None
         self.failure: NotFlown | None = None
-        """Event of a failed flight; None if it succeeded or has not ended."""
+        """Event of a failed flight; None if the flight succeeded or has not ended."""
 
     def report_transitions(self, transitions: Sequence[Transition], now_ns: int) -> None:
         """Report changes of mode or reason.
 
-        Short coasting is not reported: with event-triggered horizons it is normal.
+        Coasting that ends with a newer plan is not reported: with a trigger it is normal.
         """
         for each in transitions:
             coasts = each.reason_before is Reason.OLD and each.cause is Reason.HORIZON
@@ -78,7 +78,7 @@ class FlightLog:
         return str(Reason.LOST) if is_lost else str(self._servers.followed.idle)
 
     def report_step(self, now_ns: int) -> None:
-        """Report a late step, the fence and a leap, if the newest step had one."""
+        """Report if the newest step was late, was limited by the fence, or had a leap."""
         pilot = self._pilot
         if self._keeps_apart and pilot.late_ns > max(STALL_NS, self._latest_ns):
             late_s = pilot.late_ns / SECOND_NS
@@ -93,13 +93,13 @@ class FlightLog:
     def _report_leap(self, leap_m: tuple[float, ...] | None) -> None:
         self._reported_leap = leap_m
         if leap_m is not None and self._failsafe.has_leapt:
-            # GOOD_NS more than after a lost link: positions have to be good for that time first.
+            # After a leap the failsafe waits GOOD_NS longer than after a lost link.
             after_s = self._land_after_s + GOOD_NS / SECOND_NS if self._land_after_s else 0.0
             event = StateLeapt(vehicle=self._vehicle, by_m=leap_m, land_after_s=after_s)
             self._events.append(event)
 
     def report_end(self, now_ns: int) -> None:
-        """Report the end of the flight: finished, or failed for lack of a plan."""
+        """Report that the flight has finished, or has failed because it had no plan at its end."""
         pilot, vehicle = self._pilot, self._vehicle
         if pilot.covered and pilot.without_ns <= self._timeout_ns:
             finished = Finished(vehicle=vehicle, steps=pilot.steps, missed=pilot.missed)

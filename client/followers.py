@@ -19,8 +19,8 @@ from skytether.shared.wire.protocol import DISTURBANCE, GAIN_P, GAIN_V, REFERENC
 
 SENT = [GAIN_P, GAIN_V, DISTURBANCE]
 TABLED = [rule.GAIN_P, rule.GAIN_V, rule.DISTURBANCE]
-"""Columns of a horizon's feedback as sent (SENT), and the corresponding columns of the rule's
-table."""
+"""Columns of a horizon's feedback as sent (SENT), and the same quantities in the table of
+`shared.law.rule`."""
 
 
 class Follower(Protocol):
@@ -35,8 +35,8 @@ class Follower(Protocol):
         Args:
             stage: present stage.
             state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-            disturbance: ŵ estimated aboard, of each axis; used along a spline only [m/s].
-            before: input flown until now, of each axis; used along a spline only [m/s].
+            disturbance: ŵ estimated aboard, of each axis [m/s]; used along a spline only.
+            before: input of the previous step, of each axis [m/s]; used along a spline only.
 
         Source: eq. (11).
         """
@@ -100,8 +100,8 @@ class HorizonFollower:
         last = self._inputs[:, length - 1].tolist()
         within = [bounded(u, bound) for u, bound in zip(last, terms.u_max, strict=True)]
         self._table[:, rule.LENGTH], self._table[:, rule.FEEDS_BACK] = length, self.feeds_back
-        # Not math.hypot: its rounding differs in 17 % of cases from the square root in the server's
-        # replay.
+        # Not math.hypot: in 17 % of cases it is rounded differently from the square root in the
+        # server's replay.
         self._table[:, rule.SPEED] = math.sqrt(sum(u * u for u in within))
         self.reference = np.zeros((terms.axes, 2))
         """Reference state x̄ of the feedback at the newest stage [m, m/s]; shape (axes, 2)."""
@@ -138,7 +138,7 @@ class SplineFollower:
     Args:
         knots: position [m] and velocity [m/s] of each knot; shape (axes, n, 2).
         spacing: steps from one knot to the next.
-        length: number of stages for which it may be flown.
+        length: number of stages for which the spline may be flown.
     """
 
     feeds_back = True

@@ -1,5 +1,5 @@
-"""Log events of a vehicle on the ground: the reason why it cannot fly yet, that no server answers,
-and the silence of its server.
+"""Log events of a vehicle on the ground: why it cannot fly yet, a server that does not answer, and
+a server that falls silent.
 """
 
 from skytether.client.session import ServerSession
@@ -19,19 +19,19 @@ WAITED_NS = 2 * SECOND_NS
 SILENT_NS = 3 * SECOND_NS
 """Time beyond the time-out after which the server of a vehicle on the ground counts as silent.
 
-The server answers two HELLOs a second. One of eight is answered even if the network loses a fifth
-of the packets each way."""
+The server answers two HELLOs a second. Even if the network loses a fifth of the packets each way,
+one of eight HELLOs is nearly always answered."""
 
 
 def unanswered(session: ServerSession, left_ns: int) -> Unanswered:
-    """Event for a session that its server has not opened yet, `left_ns` before it is given up."""
+    """Event for a session that its server has not opened, `left_ns` before the client gives up."""
     (host, port), others = session.address, session.route.others
     left_s = left_ns / SECOND_NS
     return Unanswered(vehicle=session.vehicle, host=host, port=port, others=others, left_s=left_s)
 
 
 def no_answer(session: ServerSession, waited_ns: int) -> NoAnswer:
-    """Event for a session that is given up."""
+    """Event for a session that the client gives up, because no server answers."""
     host, port = session.address
     return NoAnswer(
         vehicle=session.vehicle,
@@ -56,8 +56,8 @@ class GroundReports:
         """Present reason why the vehicle cannot fly, its start time, and the last logged reason."""
         self._welcomed: int | None = None
         self._silent_ns: int | None = None
-        """Time of the newest packet before the server was reported as silent; None if it is not
-        silent."""
+        """Time of the newest packet before the server was reported as silent; None if not
+        reported."""
 
     def wait(self, waits_for: str, *, now_ns: int) -> None:
         """Report the reason why the vehicle cannot fly (empty for none) if it persists."""

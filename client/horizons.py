@@ -1,4 +1,4 @@
-"""Horizons of inputs on the vehicle: acceptance, and choice of the input of a step."""
+"""Horizons of inputs on the vehicle: whether a horizon may be flown, and its input of each step."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +11,8 @@ from skytether.shared.wire.protocol import Horizon
 def late_max(horizon: int) -> int:
     """Number of steps after the committed ones within which a horizon may still come into force.
 
-    By then the vehicle has flown other inputs than the first ones of the horizon. The next plan
-    corrects a few; many would make the server's estimate and its plans oscillate.
+    In these steps the vehicle flies other inputs than the horizon has for them. The next plan
+    corrects a few such steps; many would make the server's estimate and its plans oscillate.
     """
     # A longer allowance let the estimate oscillate until the vehicle flew away
     # (tests/server/test_slow.py).
@@ -35,8 +35,8 @@ class Horizons:
         return horizon.inputs[:, :1].repeat(self._lasts, axis=1)
 
     def is_late(self, horizon: Horizon, stage: int) -> bool:
-        """Whether a horizon arrives at a stage too long after its committed inputs, so that other
-        inputs were flown.
+        """Whether a horizon arrives, at this stage, so long after its committed inputs that too
+        many other inputs were flown.
         """
         return self._commits and stage > horizon.inputs.shape[1] - self._H + late_max(self._H)
 

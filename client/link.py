@@ -1,6 +1,6 @@
-"""The vehicle's side of the link: messages to datagrams, and back.
+"""The vehicle's side of the link: conversion of messages to datagrams, and back.
 
-`PlainLink` sends them unencrypted. `client.secure` encrypts them with the vehicle's key.
+`PlainLink` does not encrypt messages. `client.secure` encrypts them with the vehicle's key.
 """
 
 from typing import Protocol
@@ -8,9 +8,9 @@ from typing import Protocol
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 HELLO_NS = SECOND_NS
-"""Time between two HELLOs in plaintext until the server first answers."""
+"""Time between two HELLOs without keys, until the server first answers."""
 AGAIN_NS = 400 * MILLISECOND_NS
-"""Time between two HELLOs later, or with keys; a server allows at most five a second."""
+"""Time between two HELLOs after the first answer, or with keys; a server allows five a second."""
 
 
 class ClientLink(Protocol):
@@ -28,8 +28,7 @@ class ClientLink(Protocol):
         """Datagram that carries any message except a HELLO."""
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
-        """Message in a datagram; None if it was part of the handshake, whose answer is in the
-        outbox.
+        """Message in a datagram; None for a datagram of the handshake, whose answer is in `outbox`.
 
         Raises:
             ProtocolError: the datagram is not from the server.

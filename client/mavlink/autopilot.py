@@ -49,7 +49,7 @@ class Parts(NamedTuple):
 
 
 class Autopilot:
-    """One autopilot and its state as known from its messages; `altitude`: take-off altitude [m]."""
+    """One autopilot, and its state according to its messages; `altitude`: take-off altitude [m]."""
 
     parts: Parts | None = None
     """Parts of the autopilot; None until a heartbeat of a suitable autopilot has arrived."""
@@ -108,7 +108,7 @@ class Autopilot:
         return now_ns - since_ns > QUIET_NS
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
-        # If an earlier run has flown the vehicle since this boot, its parameters were safe.
+        # The parameters were safe when an earlier run flew the vehicle, since this boot.
         may_fly = self.is_ready or self.positions.is_recalled
         if self.parts is None or not may_fly or self.failure:
             return False
@@ -135,9 +135,9 @@ class Autopilot:
         return self.positions.frame(armed=self._was_armed or self.took_off)
 
     def meet(self, heartbeat: Message, target: tuple[int, int]) -> None:
-        """Begin the set-up of the autopilot that sent a heartbeat, if it can be flown.
+        """Begin the set-up of the autopilot that sent a heartbeat, if its vehicle can be flown.
 
-        `target` are the numbers of its system and component.
+        `target` has the numbers of the autopilot's system and component.
         """
         if why := unfit(heartbeat):
             self._fail("not flown", why)
@@ -179,7 +179,7 @@ class Autopilot:
         self.parts = Parts(setup, launch, streams)
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        """Process a message of the autopilot; those of an unsuitable one are ignored."""
+        """Process a message of the autopilot; ignored if the autopilot is unsuitable."""
         if self.parts is None:
             return
         condition, (setup, launch, streams) = self.condition, self.parts

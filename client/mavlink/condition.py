@@ -8,11 +8,11 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 ASTRAY_NS = 500 * MILLISECOND_NS
-"""Time for which the estimate has to be bad: flags flicker when a receiver changes satellites."""
+"""Time for which the estimate has to be bad: its flags flicker when the satellites change."""
 LOW_NS = 2 * SECOND_NS
 """Time for which the battery has to be low: its voltage sags under thrust."""
 FRESH_NS = 2500 * MILLISECOND_NS
-"""Age up to which a heartbeat counts as current: one may be lost."""
+"""Age up to which a heartbeat counts as current: one heartbeat may be lost."""
 NUMBERS = 256
 """Range of the sequence numbers of frames, which wrap around."""
 OVERTAKEN_NS = SECOND_NS
@@ -32,11 +32,11 @@ BATTERY_BAD = range(
 
 
 class Condition:
-    """Condition of the autopilot and its vehicle, as far as reported.
+    """Condition of the autopilot and its vehicle, as far as the autopilot reports it.
 
     Args:
-        battery_min: share of the battery's charge below which it is low.
-        battery_min_v: voltage below which it is low [V]; 0: not checked.
+        battery_min: charge below which the battery is low, from 0 to 1.
+        battery_min_v: voltage below which the battery is low [V]; 0: not checked.
     """
 
     def __init__(self, battery_min: float, battery_min_v: float) -> None:
@@ -64,13 +64,13 @@ class Condition:
         self._low_ns: int | None = None
         self.receiver = Receiver()
         self.has_new_fix = False
-        """Whether the newest message had a new and usable fix of the receiver."""
+        """Whether the newest message has a new and usable fix of the receiver."""
 
     def hear(self, message: Message, *, now_ns: int) -> None:
         """Process a message of the autopilot, unless a newer one arrived before it.
 
-        These messages have no time stamps: an overtaken heartbeat would undo the mode that a pilot
-        has just chosen.
+        These messages have no time stamps. Without this check an overtaken heartbeat would undo the
+        mode that a pilot has just chosen.
         """
         if self.heard_ns is not None and now_ns - self.heard_ns > UNHEARD_NS:
             self.receiver.unheard(now_ns=now_ns)
@@ -131,13 +131,13 @@ class Condition:
         return self._low_ns is not None and now_ns - self._low_ns >= LOW_NS
 
     def is_astray(self, *, now_ns: int) -> bool:
-        """Whether the estimate is bad, or will soon be: the receiver has lost its fix."""
+        """Whether the estimate is bad, or soon will be because the receiver has lost its fix."""
         if self.heard_ns is not None and self.receiver.is_lost(now_ns=self.heard_ns):
             return True
         return self._astray_ns is not None and now_ns - self._astray_ns >= ASTRAY_NS
 
     def is_fresh(self, *, now_ns: int) -> bool:
-        """Whether mode and arming are current, judging by heartbeats."""
+        """Whether mode and arming are current: a heartbeat arrived within FRESH_NS."""
         return self.heartbeat_ns is not None and now_ns - self.heartbeat_ns <= FRESH_NS
 
     @property

@@ -47,10 +47,10 @@ class Connection:
         """Address and numbers of a sender that may be the autopilot, before its first heartbeat."""
         self.codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
         self.counts: Counter[str] = Counter()
-        """Number of messages `heard`, `foreign` and `for_others`, and of datagrams from
-        `elsewhere`."""
+        """Number of messages `heard`, from other senders (`foreign`) and `for_others`, and of
+        datagrams from `elsewhere`."""
         self._elsewhere: list[Address] = []
-        """Other addresses from which something arrived while the autopilot was silent."""
+        """Other addresses from which datagrams arrived while the autopilot was silent."""
 
     def receive(self, datagram: Datagram, *, is_quiet: bool, armed: bool) -> Arrivals:
         """Sort the messages of a datagram.
@@ -69,7 +69,7 @@ class Connection:
         return arrivals
 
     def _sorted(self, messages: Sequence[Message], peer: Address) -> Arrivals:
-        """Messages by sender; the autopilot is adopted by its first heartbeat."""
+        """Messages by sender. The first heartbeat of an autopilot selects this autopilot."""
         heard, others, met = [], [], None
         for message in messages:
             sender = _sender(message)
@@ -97,7 +97,7 @@ class Connection:
         )
 
     def _is_wanted(self, sender: tuple[int, int]) -> bool:
-        """Whether these are the numbers of an autopilot that may be flown."""
+        """Whether a sender's numbers are those of an autopilot that may be flown."""
         system, component = sender
         return component == AUTOPILOT_COMPONENT and self._keys.autopilot in (0, system)
 

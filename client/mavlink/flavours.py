@@ -19,7 +19,7 @@ AIRBORNE = frozenset(
         int(dialect.MAV_TYPE_DECAROTOR),
     }
 )
-"""Types of vehicles that can hover; others are not flown."""
+"""Types of vehicles that can hover; other types are not flown."""
 
 
 class LaunchStep(Enum):
@@ -45,8 +45,8 @@ class Flavour:
     """Number of the mode during a commanded take-off."""
     steps: tuple[LaunchStep, ...]
     streams_first: bool
-    """Whether the autopilot needs set-points before it enters its guided mode; later set-points
-    also switch it back to this mode."""
+    """Whether the autopilot needs set-points before it enters its guided mode. Later set-points
+    also switch the autopilot back to this mode."""
     words_for_stations: bool
     """Whether the autopilot sends status texts to ground stations only."""
     fixed_heartbeats: bool
@@ -54,11 +54,11 @@ class Flavour:
     time_out: str
     """Name of the parameter of the set-point time-out [s]."""
     above_sea: bool
-    """Whether the take-off altitude is given above the sea, not above home."""
+    """Whether the take-off altitude is commanded above the sea, not above home."""
     bytewise: bool
     """Whether parameters are sent bytewise, see `mavlink.parameters`."""
     submodes: bool
-    """Whether a mode's number has two parts."""
+    """Whether a mode's number has two parts: main mode and sub-mode."""
     modes: dict[int, str]
 
     def mode_name(self, mode: int) -> str:
@@ -146,7 +146,7 @@ FLAVOURS = {
 
 
 def unfit(heartbeat: Message) -> str:
-    """Why the vehicle that sent a heartbeat cannot be flown; empty if it can."""
+    """Why the vehicle that sent a heartbeat cannot be flown; empty if it can be flown."""
     if heartbeat.autopilot not in FLAVOURS:
         return f"its autopilot is number {heartbeat.autopilot}, expected ArduPilot (3) or PX4 (12)"
     if heartbeat.type not in AIRBORNE:

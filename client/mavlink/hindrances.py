@@ -41,13 +41,13 @@ class Hindrances:
         self._clock, self._events = clock, events
         self.rivals, self._obedience = Rivals(), Obedience(scenario)
         self._yields = False
-        """Whether a second commander flies the vehicle, so that nothing is sent."""
+        """Whether a second commander flies the vehicle, so that the client sends no set-points."""
         self._is_taken = False
-        """Whether somebody else flies the vehicle, or has landed it and not taken off since."""
+        """Whether somebody else flies the vehicle, or landed it and has not taken off again."""
         self._was_disarmed = False
         """Whether the vehicle was disarmed since it flew, so that it is not flown again."""
         self._reported_ns: dict[Reason, int] = {}
-        """Times at which a second commander was reported, by kind of detection."""
+        """Time at which a second commander was last reported, by kind of detection."""
         self._reported_unusable = False
 
     @property
@@ -56,8 +56,8 @@ class Hindrances:
         return self._was_disarmed or self._yields or self._is_taken
 
     def command(self, velocity: Vector, *, now_ns: int) -> None:
-        """Compare the vehicle's velocity with its commands; `velocity` is commanded from now on, in
-        our axes [m/s].
+        """Compare the vehicle's velocity with its commands, and command `velocity` from now on:
+        north, east and up [m/s].
         """
         came_ns = self._positions.came_ns
         if came_ns is not None and now_ns - came_ns <= FRESH_NS:
@@ -66,7 +66,7 @@ class Hindrances:
             self._obedience.pause()
 
     def reason(self, guided: int, *, now_ns: int) -> Reason | None:
-        """Reason that forbids following a plan now; `guided` is the number of the mode that follows
+        """Reason that forbids following a plan now; `guided`: number of the mode that follows
         set-points.
         """
         condition = self._condition
@@ -107,7 +107,7 @@ class Hindrances:
         return cause
 
     def _silence(self, now_ns: int) -> Reason | None:
-        """Reason why there is no usable message of the autopilot; None if there is one."""
+        """Reason if the autopilot is silent, or its positions are unusable; None otherwise."""
         if not self._is_past(self._positions.came_ns, now_ns):
             self._reported_unusable = False
             return None if self._condition.is_fresh(now_ns=now_ns) else Reason.MUTE

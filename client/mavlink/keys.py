@@ -9,15 +9,15 @@ from skytether.shared.scenario.owners import Key, OfVehicle, Owner
 from skytether.shared.scenario.schema import Contradiction, Position, Scenario, Section
 
 ORIGIN = "origin"
-"""Group of keys: origin of the scenario's frame, for a vehicle in the air without one."""
+"""Group of keys: origin of the scenario's frame, for a vehicle in the air without an origin."""
 
 
 class MavlinkConfig(Section, frozen=True):
     """Autopilot of a vehicle of the kind `mavlink`."""
 
     system: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 245
-    """MAVLink system number of the client; ArduPilot's ground-station failsafe must listen to
-    it."""
+    """MAVLink system number of the client; ArduPilot's ground-station failsafe must watch for this
+    number."""
     component: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 191
     """MAVLink component number of the client; 191: onboard computer."""
     autopilot: OfVehicle[Annotated[int, Meta(ge=0, le=255)]] = 0
@@ -31,17 +31,17 @@ class MavlinkConfig(Section, frozen=True):
     battery_min_v: OfVehicle[Annotated[float, Meta(ge=0, le=100)]] = 0.0
     """Voltage of the battery below which the vehicle lands [V]; 0: no limit."""
     takeoff_m: OfVehicle[Annotated[float, Meta(ge=0.5, le=100)] | Literal["auto"]] = "auto"
-    """Take-off altitude [m]; auto: that of the trajectory's start, or 3 m in the plane."""
+    """Take-off altitude [m]; auto: altitude of the reference's start, or 3 m with two axes."""
     origin: Annotated[
         Literal["takeoff", "autopilot"] | tuple[Position, ...],
         Key(Owner.VEHICLE, ORIGIN),
     ] = "takeoff"
     """Origin of the scenario: the point of arming (on a mission, below the first goal), the
     autopilot's local origin, or a point in its local frame: north, east (and up) [m]. A client that
-    restarts in the air without a saved origin hovers until this key is set."""
+    restarts in the air without a saved origin lets the vehicle hover until this key is set."""
     second_commander: OfVehicle[Literal["brake", "yield"]] = "brake"
     """Reaction to a second commander, or to a vehicle that ignores its commands: brake and then
-    land; or yield, as if a pilot had taken over."""
+    land, or yield as if a pilot had taken over."""
     patience_s: OfVehicle[Annotated[float, Meta(ge=1, le=600)]] = 60.0
     """Longest wait for the first heartbeat, and for each step of take-off [s]."""
 

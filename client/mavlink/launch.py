@@ -5,11 +5,11 @@
 A step is done when the autopilot's own state says so; until then its command is repeated. A vehicle
 is armed only on the ground and only if `armed` is set in the scenario. A mode chosen by somebody
 else is not changed: once the vehicle is armed, the client replaces only a mode that it has set, or
-to which its take-off command led. A pilot returns control by the mode that follows set-points.
+to which its take-off command led. A pilot returns control with the mode that follows set-points.
 
 A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
-an operator allows it: a process restarted after a landing must not take off. A vehicle in the air
-whose origin is unknown hovers until an operator gives the origin.
+an operator allows arming: a process restarted after a landing must not make the vehicle take off. A
+vehicle in the air whose origin is unknown hovers until an operator gives the origin.
 """
 
 from enum import Enum, auto
@@ -39,16 +39,16 @@ RETURN_MAX_NS = 600 * SECOND_NS
 REFUSED_NS = 4 * SECOND_NS
 """Time after which a vehicle that ignores the command to return is commanded to land."""
 QUIET_NS = 3 * SECOND_NS
-"""Time after which the autopilot's silence is reported as the reason for an unfinished step."""
+"""Silence of the autopilot after which it is given as the reason for an unfinished step."""
 SILENT_MAX_NS = 10 * SECOND_NS
 """Silence of the autopilot after which the client stops waiting for the end of a landing."""
 THERE_M = 0.3
-"""Distance from the take-off altitude within which the climb is over [m]."""
+"""Distance below the take-off altitude within which the climb may count as over [m]."""
 LIFTED_M = 1.0
 """Distance below the take-off altitude from which the autopilot may end the climb by itself: PX4
 ends it at NAV_MC_ALT_RAD, by default 0.8 m."""
 STILL_MPS = 0.3
-"""Vertical speed below which the climb is over [m/s]."""
+"""Vertical speed below which the climb may count as over [m/s]."""
 SET_MODE = int(dialect.MAV_CMD_DO_SET_MODE)
 ARM = int(dialect.MAV_CMD_COMPONENT_ARM_DISARM)
 TAKE_OFF = int(dialect.MAV_CMD_NAV_TAKEOFF)
@@ -113,19 +113,19 @@ class Launch:
         or after somebody else has changed the mode."""
         self._lift_asked = False
         self.why_not_armed = ""
-        """Why an operator has to allow arming; empty if not needed."""
+        """Why an operator has to allow arming; empty if arming needs no permission."""
         self._asked_to_arm = False
         self._hovers_ns: int | None = None
         """Time since which the vehicle hovers because the origin is unknown; None if it does not
         hover."""
         self.took_off = False
         self._closed = False
-        """Whether take-off is no longer allowed."""
+        """Whether take-off is no longer allowed, because the process ends."""
         self._landing_mode = flavour.land
         self.waits_for = ""
         """Reason why the vehicle cannot take off yet, in words; empty if there is none."""
         self._stated_reason = ""
-        """Reason for a refusal that the autopilot gave in the present step of the launch."""
+        """Reason that the autopilot gave for a refusal in the present step of the launch."""
         self._refused: set[tuple[int, int]] = set()
         """Refusals reported in the present step of the launch: command and result."""
         self.failure: NotTakenOff | None = None
@@ -200,7 +200,7 @@ class Launch:
             self._events.append(OriginAwaited(vehicle=self._vehicle, place=place))
         elif now_ns - self._hovers_ns > self._patience_ns:
             waited = f"not flown in {self._patience_ns / SECOND_NS:g} s"
-            self._enter(Phase.FLYING, now_ns)  # otherwise the vehicle would not be landed
+            self._enter(Phase.FLYING, now_ns)  # `_fail` lands only a vehicle in flight
             self._fail(waited, "its origin is unknown, see mavlink.origin", now_ns)
 
     def _ask_to_arm(self) -> None:
@@ -210,7 +210,7 @@ class Launch:
             self._events.append(ArmingAwaited(vehicle=self._vehicle, why=self.why_not_armed))
 
     def arm(self) -> None:
-        """Allow arming, on an operator's order; ignored unless the vehicle is on the ground."""
+        """Allow arming, on an operator's order; no effect unless the vehicle is on the ground."""
         condition = self._condition
         if self.phase is Phase.GROUND and not (condition.armed or condition.is_airborne):
             self.why_not_armed, self._asked_to_arm = "", False
@@ -301,40 +301,38 @@ class Launch:
     # -- landing ----------------------------------------------------------------------------
 
     def return_home(self, *, now_ns: int) -> None:
-        """Return home and land there, if the vehicle is under our control and in the air."""
+        """Return home and land there, if the client controls the vehicle and it is in the air."""
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
             self._landing_mode = self._flavour.back
         self.land(now_ns=now_ns)
 
     def land(self, *, now_ns: int) -> None:
-        """Land, if the vehicle is under our control and in the air."""
+        """Land, if the client controls the vehicle and it is in the air."""
         if self.phase in (Phase.CLIMBING, Phase.FLYING):
             self._enter(Phase.LANDING, now_ns)
 
     def close(self, *, now_ns: int) -> list[Message]:
-        """End the launch; returns messages that land the vehicle if it is under our control."""
+        """End the launch; returns messages that land the vehicle if the client controls it."""
         self._closed = True
         if self.phase is Phase.GROUND or not self._is_ours(now_ns):
             return []
         return [self._mode_command(self._flavour.land)]
 
     def _is_ours(self, now_ns: int) -> bool:
-        """Whether the vehicle is armed and in a mode of the client, as far as is currently
-        known.
-        """
+        """Whether the vehicle is armed and in a mode of the client, by a current heartbeat."""
         condition = self._condition
         return self._has_own_mode(now_ns) and condition.armed and condition.is_fresh(now_ns=now_ns)
 
     def _has_own_mode(self, now_ns: int) -> bool:
-        """Whether nobody else has chosen the present mode; changes of mode by the client's own
-        commands are followed.
+        """Whether nobody else has chosen the present mode. Changes of mode that the client's own
+        commands cause are expected.
         """
         mode, flavour = self._condition.mode, self._flavour
         is_high = self._positions.altitude >= self._altitude - LIFTED_M
         if self._holds_first(mode):
             self._own_mode = mode
         elif self._own_mode == flavour.hold and self._lift_asked and not is_high:
-            # The mode before the command is reported until the next heartbeat.
+            # Until the next heartbeat the known mode is the one before the command.
             if mode == flavour.lift or self._is_late_to_lift(now_ns):
                 self._own_mode = flavour.lift
         elif self._own_mode == flavour.lift and is_high and mode == flavour.hold:
@@ -345,7 +343,7 @@ class Launch:
         return False
 
     def _holds_first(self, mode: int) -> bool:
-        """Whether the vehicle is in the mode that the first step waits for."""
+        """Whether the client has set the mode that the first step waits for."""
         if self.phase is not Phase.CLIMBING or mode != self._flavour.hold:
             return False
         is_asked = self._asked_ns is not None or not self._condition.armed
@@ -414,7 +412,7 @@ class Launch:
             if self._condition.home is None:
                 self._stated_reason = "its autopilot reports no home position"
                 return None
-            # The height estimate has drifted since home was set.
+            # The estimated altitude of the ground has drifted since home was set.
             ground = self._positions.origin[2] - self._condition.home_up
             altitude += self._condition.home[2] + ground
         self._lift_asked = True

@@ -5,14 +5,14 @@ The commanded velocity u of an axis gives two bounds of the real velocity, low a
     high(t) = max(g u of the last θ + 0.3 s, each with an error of a quarter;  high(t - Δt) - a Δt)
 
 and low likewise: a vehicle may follow at once, or as slowly as with a = 1 m/s² and 0.3 s later than
-its dead time θ. Neither wind nor model errors explain a velocity outside these bounds by more than
-a share of 1 m/s + fence.wind_mps, over all axes: somebody else commands the autopilot, or it has
-failed. The share is smaller if the deviation lasts longer:
+its dead time θ. Wind and model errors explain a velocity outside these bounds up to a share of D =
+1 m/s + fence.wind_mps, over all axes. Beyond that somebody else commands the autopilot, or the
+autopilot has failed. The share is smaller if the deviation lasts longer:
 
-    all of it for 0.1 s;  3/4 for 3 s;  1/5 for 5 s while no command has its direction
+    D for 0.1 s;  3/4 D for 3 s;  1/5 D for 5 s while no command has the direction of the motion
 
-Such a vehicle counts as obedient again once the deviation has stayed below 0.15 of it for 0.5 s.
-After a second deviation within a minute it never does: the other commander is still active.
+Such a vehicle counts as obedient again once the deviation has stayed below 0.15 D for 0.5 s. After
+a second deviation within a minute it stays disobedient: the other commander is still active.
 
 `python -m pytest tests/client/test_rivals_aboard.py` flies both autopilots in wind and turbulence,
 with models wrong by 30 % and 20 %, without a false alarm. The largest deviations there, on PX4 with
@@ -29,18 +29,18 @@ from skytether.shared.fence.keys import FenceConfig
 from skytether.shared.scenario.schema import Scenario
 
 LATER_NS = 300 * MILLISECOND_NS
-"""Time by which an input may act later than the model's dead time."""
+"""Time after the model's dead time within which an input may begin to act."""
 ERROR = 0.25
 SLOW_MPS2 = 1.0
 """Acceleration of the slowest vehicle [m/s²]."""
 MARGIN_MPS = 1.0
-"""Deviation of velocity allowed in calm air."""
+"""Deviation of velocity allowed in calm air [m/s]."""
 NOTICED = (
     (1.0, 100 * MILLISECOND_NS, math.inf),
     (0.75, 3 * SECOND_NS, math.inf),
     (0.2, 5 * SECOND_NS, 0.1),
 )
-"""Rows: share of the allowed deviation, time for which the deviation has to be larger, and largest
+"""Rows: share of the allowed deviation, time for which the deviation has to exceed it, and largest
 command in the direction of motion for which the row applies [m/s]."""
 CALM_SHARE, QUIET_NS = 0.15, 500 * MILLISECOND_NS
 """Share of the allowed deviation below which the deviation has to stay for QUIET_NS, until the
@@ -63,9 +63,9 @@ class Obedience:
         self._stepped_ns: int | None = None
         self._outside_ns: list[int | None] = [None] * len(NOTICED)
         """Time since which the deviation has been too large, by row of NOTICED; None if it is
-        not."""
+        small."""
         self._restless_ns = 0
-        """Newest time at which the deviation was too large for an obedient vehicle."""
+        """Newest time at which the deviation was too large to count as obedient again."""
         self.strays = self._is_final = False
         self._ended_ns: int | None = None
         """Time at which the newest disobedience ended; None without one."""
@@ -78,12 +78,12 @@ class Obedience:
         self.strays, self._is_final, self._ended_ns = False, False, None
 
     def pause(self) -> None:
-        """Compare again from the next velocity on; a disobedient vehicle stays disobedient."""
+        """Start anew at the next velocity; a disobedient vehicle stays disobedient."""
         self._commands.clear()
         self._stepped_ns, self._outside_ns = None, [None] * len(NOTICED)
 
     def step(self, command: Vector, velocity: Vector, *, now_ns: int) -> None:
-        """Compare a velocity with the commands, both in our axes [m/s].
+        """Compare a velocity with the commands, both north, east and up [m/s].
 
         `command` applies from now on.
         """

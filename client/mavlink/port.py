@@ -1,8 +1,8 @@
 """The connection to the autopilot as an endpoint: all messages from it and to it.
 
-The endpoint's own loop sends a heartbeat each second and, while the pilot flies, the desired
-velocity, never a position. If this loop ends, no set-point is sent any more, and the autopilot's
-own time-out acts: no set-point is repeated after the pilot has stopped.
+The port sends a heartbeat each second and, while the pilot (`client.pilot`) flies, the desired
+velocity, never a position. When the pilot stops, set-points are repeated for half a second only.
+Then, and when the process ends, the autopilot's own time-out acts.
 """
 
 from typing import Any
@@ -24,7 +24,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 TICK_NS = 100 * MILLISECOND_NS
-"""Interval between checks for due messages other than set-points."""
+"""Interval between two checks for messages that are due, other than set-points."""
 HEARTBEAT_NS = SECOND_NS
 CLOSES = 3
 """Number of times that a vehicle in the air is commanded to land when the process ends."""
@@ -65,7 +65,7 @@ class Port(Endpoint):
         return self._hindrances.reason(self.autopilot.flavour.guided, now_ns=now_ns)
 
     def fly(self, velocity: Vector) -> None:
-        """Send a velocity now, unless one was just sent, and repeat it for a while."""
+        """Send a velocity now, unless a set-point was just sent, and repeat it for a while."""
         self._hindrances.command(velocity, now_ns=self.now_ns)
         if self._setpoints.command(velocity, now_ns=self.now_ns):
             self._send_setpoint()
@@ -126,7 +126,7 @@ class Port(Endpoint):
             self._say(_heartbeat(dialect.MAV_TYPE_GCS))
 
     def _request_heartbeat(self) -> None:
-        """Request the first heartbeat: unrequested, it may come a second later, and a client
+        """Request the first heartbeat. Without a request it may come a second later, but a client
         restarted in flight has to send set-points earlier.
         """
         if self._connection.unmet is not None:
@@ -135,19 +135,19 @@ class Port(Endpoint):
             self.send(self._connection.codec.encode(wanted), peer)
 
     def _is_given_up(self) -> bool:
-        """Whether the vehicle ignores the command to land. Its own failsafe lands it once the
-        client stops its heartbeats.
+        """Whether the autopilot is silent during a landing. The client then stops its heartbeats,
+        so that the autopilot's own failsafe lands the vehicle.
         """
         parts, condition = self.autopilot.parts, self.autopilot.condition
         lands = parts is not None and parts.launch.phase is Phase.LANDING
         return lands and not condition.is_fresh(now_ns=self.now_ns)
 
     def _may_be_station(self) -> bool:
-        """Whether to announce the client to PX4 as a ground station too: PX4 sends its texts to
-        stations only.
+        """Whether the client also sends heartbeats of a ground station: PX4 sends its texts to
+        ground stations only.
 
-        False if PX4 reacts to the loss of its ground station: it would no longer notice the loss of
-        another station.
+        False if PX4 reacts to the loss of its ground station: PX4 would no longer notice the loss
+        of another station.
         """
         parts = self.autopilot.parts
         return (
@@ -189,7 +189,7 @@ class Port(Endpoint):
             self.send(self._connection.codec.encode(message), self._connection.peer)
 
     def close(self, *, now_ns: int) -> None:
-        """Command a vehicle in the air under our control to land by itself."""
+        """Command a vehicle in the air to land by itself, if the client controls it."""
         self.now_ns = now_ns
         if (parts := self.autopilot.parts) is not None:
             for message in parts.launch.close(now_ns=now_ns) * CLOSES:

@@ -1,4 +1,4 @@
-"""Measurements from LOCAL_POSITION_NED, in our axes."""
+"""Measurements from LOCAL_POSITION_NED, as north, east and up."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ FRESH_NS = 200 * MILLISECOND_NS
 
 
 def given_origin(scenario: Scenario) -> Vector | None:
-    """Origin given by a scenario, in our axes [m]; None if it is the place of take-off."""
+    """Origin given by a scenario: north, east and up [m]; None if it is the place of take-off."""
     match scenario.section(MavlinkConfig).origin:
         case "takeoff":
             return None
@@ -24,7 +24,7 @@ def given_origin(scenario: Scenario) -> Vector | None:
             return 0.0, 0.0, 0.0
         case (x, y, *up):
             return float(x), float(y), float(up[0]) if up else 0.0
-    raise AssertionError  # `contradictions` has refused all other values
+    raise AssertionError  # `MavlinkConfig.contradictions` refuses other values
 
 
 class Positions(positions.Positions):
@@ -36,7 +36,7 @@ class Positions(positions.Positions):
         self._slides = Slides()
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        # The stamp is in whole milliseconds: the middle of the millisecond is the best guess.
+        # The stamp is in whole milliseconds; the middle of the millisecond is the best guess.
         boot_ns = message.time_boot_ms * MILLISECOND_NS + MILLISECOND_NS // 2
         position = turned((message.x, message.y, message.z))
         velocity = turned((message.vx, message.vy, message.vz))
@@ -46,7 +46,7 @@ class Positions(positions.Positions):
         """Compare the position with a fix of the receiver.
 
         Args:
-            velocity: the receiver's velocity, north and east [m/s]; None if it measures none.
+            velocity: the receiver's velocity, north and east [m/s]; None if not measured.
             stamp_ns: time of the fix, by the autopilot's clock [ns].
         """
         if velocity is None or self.position is None or self.came_ns is None or not self.is_flown:
@@ -54,11 +54,11 @@ class Positions(positions.Positions):
         is_old = now_ns - self.came_ns > FRESH_NS
         if is_old or self.origin != self._origin_before:
             self._slides.begin()
-        if is_old:  # later positions were dropped; this position is older than the fix
+        if is_old:  # newer positions were dropped, so this one is much older than the fix
             return
         (north, east, _), (x, y, _) = self.position, self.origin
         slide = self._slides.slid((north - x, east - y), velocity, stamp_ns)
         if slide is not None:
-            # The operator is asked once per slide, not about the rest of the slide.
+            # The operator is asked at the beginning of a slide, not again while it grows.
             self.displace((*slide.by_m, 0.0), asks=slide.begins or self.leap_m is not None)
         self._origin_before = self.origin

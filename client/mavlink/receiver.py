@@ -1,7 +1,7 @@
 """Position receiver of an autopilot, from GPS_RAW_INT: whether it has a fix, and its velocity.
 
-An autopilot flies on for seconds after the last fix, by its accelerometers alone, before its own
-flags say so. A vehicle whose receiver had no fix since the client's start uses another source.
+After the last fix an autopilot flies on by its accelerometers for seconds before its flags report
+it. A vehicle whose receiver had no fix since the client's start has another position source.
 """
 
 import math
@@ -11,9 +11,9 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 LOST_NS = 1500 * MILLISECOND_NS
-"""Time without a usable fix after which the receiver counts as lost, unless fixes are rare."""
+"""Time without a usable fix after which the fix counts as lost, unless fixes are rare."""
 FEWEST = 3
-"""Number of usual intervals without a fix after which the receiver counts as lost."""
+"""Number of usual intervals without a fix after which the fix counts as lost."""
 INTERVAL_MAX_NS = 2 * SECOND_NS
 """Largest time between two fixes that counts as a usual interval."""
 UNHEARD_NS = SECOND_NS // 2
@@ -27,17 +27,17 @@ US_NS = 1000
 class Receiver:
     def __init__(self) -> None:
         self.stamp_ns = -1
-        """Time of the newest usable fix, on the autopilot's clock, or of its arrival if it has no
-        time [ns]; -1 before the first."""
+        """Time of the newest usable fix on the autopilot's clock; its arrival if it has no time
+        stamp [ns]; -1 before the first fix."""
         self.velocity: tuple[float, float] | None = None
-        """Velocity of the newest usable fix, north and east [m/s]; None if the fix has none."""
+        """Velocity of the newest usable fix, north and east [m/s]; None if not measured."""
         self._fix_ns: int | None = None
-        """Time from which the time without a fix counts [ns]: arrival of the fix, or later."""
+        """Start of the time without a fix [ns]: arrival of the newest fix, or later."""
         self._interval_ns = 0
 
     def hear(self, message: Message, *, now_ns: int) -> bool:
         """Process a GPS_RAW_INT; returns whether it has a new and usable fix."""
-        stamp_ns = message.time_usec * US_NS or now_ns  # 0: PX4, while the date is unknown
+        stamp_ns = message.time_usec * US_NS or now_ns  # 0: PX4 does not know the date yet
         if not _is_usable(message) or stamp_ns == self.stamp_ns:
             return False
         if self._fix_ns is not None and now_ns - self._fix_ns <= INTERVAL_MAX_NS:
@@ -50,7 +50,7 @@ class Receiver:
         return True
 
     def unheard(self, *, now_ns: int) -> None:
-        """Note that all messages have paused: the time without a fix counts from now on."""
+        """Note a pause of all messages: the time without a fix is counted from now on."""
         if self._fix_ns is not None:
             self._fix_ns = now_ns
 

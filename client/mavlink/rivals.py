@@ -1,4 +1,4 @@
-"""Second commanders: other systems on the network that command our autopilot.
+"""Second commanders: other systems on the network that command the client's autopilot.
 
 An autopilot obeys the latest command of any sender. This module detects commanders whose messages a
 router or radio passes on to the client; `obedience` detects the others by their effect.
@@ -13,8 +13,7 @@ from skytether.shared.base.units import SECOND_NS
 WINDOW_NS = SECOND_NS
 """Window in which set-points are counted."""
 LEAST = 2
-"""Number of set-points in the window that count as a second commander; one alone may be a stray
-packet."""
+"""Number of set-points in the window that reveal a second commander; a single one may be stray."""
 QUIET_NS = 3 * SECOND_NS
 """Silence after which a second commander counts as gone."""
 STREAMS = frozenset(
@@ -34,19 +33,19 @@ GOTO = frozenset(
         int(dialect.MAV_CMD_OVERRIDE_GOTO),
     }
 )
-"""Commands that move a vehicle in its present mode, and are sent once. A change of mode is detected
-from heartbeats."""
+"""Commands that move a vehicle in its present mode; they are sent once. Changes of mode are
+detected from heartbeats."""
 GUIDED_ITEM = (2, 3)
 """Values of `current` that mark a mission item as a goal or an altitude to fly to at once."""
 STICK = 50
-"""Smallest stick deflection that counts: of at most 1000 units, or of at most 500 µs."""
+"""Stick deflection above which a pilot commands; full deflection: 1000 units, or 500 µs."""
 CENTRE_US = 1500
 UNUSED_US = (0, 65535)
 """Pulse widths of a channel that is not overridden [µs]."""
 
 
 class Rivals:
-    """Other systems that command our autopilot, as far as their messages arrive here."""
+    """Other systems that command the client's autopilot, as far as their messages arrive here."""
 
     def __init__(self) -> None:
         self._times_ns: deque[int] = deque(maxlen=LEAST)
@@ -57,7 +56,7 @@ class Rivals:
         message."""
 
     def hear(self, message: Message, system: int, *, now_ns: int) -> None:
-        """Process a message of another sender; `system` is the number of our autopilot's system."""
+        """Process a message of another sender; `system`: number of the autopilot's system."""
         weight = _weight(message, system)
         for _ in range(weight):
             self._times_ns.append(now_ns)

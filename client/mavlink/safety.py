@@ -4,7 +4,7 @@
 one second at most, and once the client's process has ended it has to come down; hovering or flying
 on for ever is unsafe.
 
-The autopilot is unsafe if it lacks a required parameter; any other is reported as missing.
+The autopilot is unsafe if it lacks a required parameter; other missing ones are only reported.
 """
 
 import math
@@ -17,9 +17,9 @@ from skytether.shared.law.model import ALTITUDE
 from skytether.shared.scenario.schema import Scenario
 
 SILENCE_MAX_S = 1.0
-"""Longest time for which a vehicle may fly on without set-points."""
+"""Longest time for which a vehicle may fly on without set-points [s]."""
 SILENCE_MIN_S = 0.2
-"""Shortest usable time-out if set-points arrive at 10 Hz."""
+"""Shortest usable time-out for set-points that arrive at 10 Hz [s]."""
 TOLERANCE = 1e-6
 """Rounding error of a decimal number stored as float32."""
 
@@ -111,7 +111,7 @@ def _options(value: float) -> str:
 
 
 CLEAR_M = 1.0
-"""Distance from the fence down to the return altitude that the client sets [m]."""
+"""Distance by which the return altitude that the client sets is below the fence [m]."""
 
 
 def _below(value: float, below_m: float) -> bool:
@@ -119,7 +119,7 @@ def _below(value: float, below_m: float) -> bool:
 
 
 def _returning(name: str, what: str, below_m: float, scale: float) -> Rule:
-    """Rule that a vehicle returns below the fence.
+    """Rule for a parameter that has to be below the fence: an altitude of the return home.
 
     Args:
         what: what the vehicle does at that altitude, such as "returns home".
@@ -168,7 +168,7 @@ def _px4_returns(below_m: float | None) -> tuple[Rule, ...]:
 
 
 def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, ...]:
-    """Rules for ArduCopter, for `system` as the client's own MAVLink system.
+    """Rules for the parameters of ArduCopter; `system`: MAVLink system number of the client.
 
     `returns_below_m`: altitude below which the vehicle has to return home; None: it lands in place.
     """
@@ -235,8 +235,8 @@ def ardupilot(system: int, returns_below_m: float | None = None) -> tuple[Rule, 
 
 
 def px4(returns_below_m: float | None = None) -> tuple[Rule, ...]:
-    """Rules for PX4; `returns_below_m`: altitude below which the vehicle has to return home; None:
-    it lands in place.
+    """Rules for the parameters of PX4; `returns_below_m`: altitude below which the vehicle has to
+    return home [m]; None: the vehicle lands in place.
     """
     return (
         *_px4_returns(returns_below_m),

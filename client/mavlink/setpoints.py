@@ -16,10 +16,10 @@ UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time after which a silent pilot counts as gone; then no set-point is sent."""
 SETPOINTS_MIN_HZ, SETPOINTS_MAX_HZ = 20, 50.0
 CURRENT_NS = 300 * MILLISECOND_NS
-"""Time after a pause of set-points before a heartbeat counts as current: an earlier one may have
-waited in a queue."""
+"""Time after a pause of set-points before a heartbeat counts as current: an earlier heartbeat may
+have waited in a queue."""
 LATE = 1.1
-"""Number of intervals after which a set-point is repeated; above 1, as steps may be late."""
+"""Number of intervals after which a set-point is repeated; above 1, because steps may be late."""
 ZERO_NS = 50 * MILLISECOND_NS
 """Interval between zero set-points, if a mode needs a stream of them."""
 VELOCITY_ALONE = 0b110111000111
@@ -42,15 +42,15 @@ class Setpoints:
         parts = -(-step_ns * SETPOINTS_MIN_HZ // SECOND_NS)
         self._repeat_ns = round(LATE * step_ns / parts)
         self._velocity = ZERO
-        """Desired velocity, in our axes [m/s]."""
+        """Desired velocity north, east and up [m/s]."""
         self._flown_ns: int | None = None
         self._sent_ns: int | None = None
         self._mode_awaited_ns: int | None = None
-        """Start of the wait for a current mode after a pause; None while set-points do not wait."""
+        """Start of the wait for a heartbeat with the mode after a pause; None without a wait."""
         self.count = 0
 
     def command(self, velocity: Vector, *, now_ns: int) -> bool:
-        """Adopt the pilot's command. Return whether to send it now: not if one was just sent."""
+        """Adopt the pilot's command. Return whether to send it now: at most at SETPOINTS_MAX_HZ."""
         self._velocity, self._flown_ns = velocity, now_ns
         least_ns = SECOND_NS / SETPOINTS_MAX_HZ
         return self._sent_ns is None or now_ns - self._sent_ns >= 0.9 * least_ns
@@ -67,14 +67,14 @@ class Setpoints:
     def take(
         self, sends: Sends, *, leaves_ns: int | None, heartbeat_ns: int | None, now_ns: int
     ) -> Vector | None:
-        """Velocity to be sent now, in our axes [m/s]; None if none may be sent.
+        """Velocity to be sent now, north, east and up [m/s]; None if none may be sent.
 
-        After a pause the autopilot may have left its guided mode, and a set-point would bring it
-        back there. So a heartbeat with its mode has to arrive first.
+        After a pause the autopilot may have left its guided mode, and a set-point would switch it
+        back to this mode. So a heartbeat with the present mode has to arrive first.
 
         Args:
             leaves_ns: pause after which the autopilot leaves its guided mode [ns]; None if a
-                set-point never brings it back.
+                set-point never switches it back to this mode.
             heartbeat_ns: time of the autopilot's newest heartbeat.
         """
         if sends is Sends.NOTHING:
@@ -100,9 +100,7 @@ class Setpoints:
 
 
 def message(target: tuple[int, int], velocity: Vector, *, now_ns: int) -> Message:
-    """Set-point message to `target`, the numbers of system and component; velocity in our axes
-    [m/s].
-    """
+    """Set-point for system and component `target`, with a velocity north, east and up [m/s]."""
     return dialect.MAVLink_set_position_target_local_ned_message(
         now_ns // MILLISECOND_NS % 2**32,
         *target,

@@ -27,8 +27,8 @@ from skytether.shared.events.aboard import (
 
 AGAIN_NS = 400 * MILLISECOND_NS
 TRIES = 10
-"""Number of times that a question is sent; with 10 % loss each way, one in ten million stays
-unanswered."""
+"""Number of times that a question is sent: with 10 % loss each way, one question in ten million
+stays unanswered."""
 AT_ONCE = 4
 """Largest number of unanswered questions at once, because serial lines are slow."""
 VERSION = int(dialect.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
@@ -67,7 +67,7 @@ class Setup:
         self._version: str | None = None
         self._version_tries = 0
         self._tries: dict[str, int] = {name: 0 for rule in self._rules for name in rule.names}
-        """Number of times that each unknown parameter was requested or set."""
+        """Number of attempts to read or set each parameter that is not settled yet."""
         self._values: dict[str, float] = {}
         self._kinds: dict[str, int] = {}
         self._setting: dict[str, tuple[float, float]] = {}
@@ -111,12 +111,12 @@ class Setup:
         if name in self._setting:
             before, wanted = self._setting[name]
             if abs(value - wanted) > safety.TOLERANCE:
-                return  # an old answer, or a refusal: set it again
+                return  # an old answer, or a refusal: the parameter is set again
             del self._setting[name]
             self._changed.append((name, before, value))
         self._values[name], self._kinds[name] = value, kind
         for rule in self._rules:
-            if name in rule.names:  # the autopilot has the parameter under one name only
+            if name in rule.names:  # an autopilot has a parameter under one name only
                 for other_name in rule.names:
                     self._tries.pop(other_name, None)
 

@@ -1,6 +1,6 @@
 """Streams of messages, requested again if they do not arrive.
 
-If the rate of an autopilot's heartbeats is fixed, each additional heartbeat is requested.
+If the rate of an autopilot's heartbeats is fixed, additional heartbeats are requested one by one.
 """
 
 from collections.abc import Mapping
@@ -15,12 +15,12 @@ HEARTBEAT = int(dialect.MAVLINK_MSG_ID_HEARTBEAT)
 SHARE = 0.7
 """Share of the requested rate at which a stream counts as present."""
 WINDOW_NS = 2 * SECOND_NS
-"""Window in which messages are counted, longer if LEAST messages need more time."""
+"""Shortest window in which messages are counted; longer if LEAST messages need more time."""
 LEAST = 3.0
 BACK_OFF_MAX = 8
-"""Longest window, as a multiple of the shortest: some streams are silent for long."""
+"""Longest window of a missing stream, as a multiple of its shortest window."""
 HEARTBEAT_HZ = 5.0
-"""Rate of heartbeats: they show a pilot's mode switch."""
+"""Rate of heartbeats [Hz], which show when a pilot switches the mode."""
 RATES = {
     int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 5.0,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): 10.0,

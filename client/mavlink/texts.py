@@ -1,4 +1,4 @@
-"""Log of the autopilot's texts, with repeats left out and their rate limited."""
+"""Log of the autopilot's status texts, without repeats and at a limited rate."""
 
 from skytether.mavlink.codec import Message
 from skytether.mavlink.text import Texts
@@ -11,7 +11,7 @@ SAME_TEXT_NS = 30 * SECOND_NS
 TEXTS_KEPT = 16
 """Number of texts remembered, and largest number logged at once."""
 TEXT_NS = 2 * SECOND_NS
-"""Time after which one more text may be logged."""
+"""Interval after which one more text may be logged."""
 
 
 class LoggedTexts:
@@ -20,7 +20,7 @@ class LoggedTexts:
         self._texts = Texts()
         self._logged_ns: dict[str, int] = {}
         self._left, self._left_ns = TEXTS_KEPT, 0
-        """Number of texts that may be logged now, and the time at which it last changed."""
+        """Number of texts that may be logged now, and the time of its newest increase [ns]."""
         self._omitted = 0
         """Number of texts not logged since the last report of this number."""
 
@@ -50,7 +50,7 @@ class LoggedTexts:
         return False
 
     def tick(self, *, now_ns: int) -> None:
-        """Allow one more text each TEXT_NS, and report how many were left out."""
+        """Allow one more text each TEXT_NS, and report how many texts were left out."""
         if now_ns - self._left_ns < TEXT_NS:
             return
         self._left_ns, self._left = now_ns, min(self._left + 1, TEXTS_KEPT)
@@ -60,5 +60,5 @@ class LoggedTexts:
 
 
 def _printable(text: str) -> str:
-    """Text without control characters; PX4 ends some texts with a tab."""
+    """Text with ? for control characters, without white space at its end (PX4 sends tabs)."""
     return "".join(letter if letter.isprintable() else "?" for letter in text.rstrip())

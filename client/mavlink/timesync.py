@@ -10,7 +10,7 @@ from skytether.shared.endpoints.endpoint import Events
 from skytether.shared.events.aboard import ClockSilent
 
 BEGIN_NS, INTERVAL_NS = 100 * MILLISECOND_NS, SECOND_NS
-"""Interval between questions before the clock is known, and after."""
+"""Interval between two questions before the clock is known, and afterwards."""
 SILENT_NS = 10 * SECOND_NS
 """Time without an answer after which the missing answers are reported."""
 
@@ -22,7 +22,7 @@ class Timesync:
         self._clock, self._vehicle, self._events = clock, vehicle, events
         self._next_ns = 0
         self._jumps = 0
-        """Number of the clock's restarts already reported by `hear`."""
+        """Number of the clock's jumps for which `hear` has already reported a restart."""
         self._reported_silent = False
         self.untimely = 0
 
@@ -44,7 +44,7 @@ class Timesync:
         return True
 
     def ask(self, *, is_heard: bool, now_ns: int) -> list[Message]:
-        """Question if one is due. An autopilot that sends messages but no answers is reported."""
+        """Question, if one is due. Reports an autopilot that sends messages but no answers."""
         clock, was_reported = self._clock, self._reported_silent
         silent_ns = now_ns - clock.heard_ns if clock.is_known and is_heard else 0
         self._reported_silent = silent_ns > SILENT_NS
