@@ -72,7 +72,7 @@ def by_position(P: Spread, variance: float) -> tuple[Gain, Spread]:
     pp, pv, pw, vv, vw, ww = P
     total = pp + variance
     kp, kv, kw = pp / total, pv / total, pw / total
-    # 1 - K is computed as variance / total: the difference loses digits if K is near 1.
+    # 1 - kp = variance / total: computed by division, as the difference loses digits near kp = 1.
     share = variance / total
     return (kp, kv, kw), Spread(
         share * pp, share * pv, share * pw, vv - kv * pv, vw - kv * pw, ww - kw * pw

@@ -10,12 +10,12 @@ saves, outside the process:
     the number of the leadership          plans of an earlier leadership are not flown
     whether the vehicle was armed         starting a process must not arm it
 
-A client opens no file: `SavingClient.keep` returns the state's bytes when they have changed,
-`shell.driving.memory` writes them and confirms by `SavingClient.kept`. **Nothing is sent to a
+A client opens no file: `SavingClient.keep` returns the state's bytes when the state has changed,
+and `shell.driving.memory` writes them and then calls `SavingClient.kept`. **Nothing is sent to a
 server before the state is saved**: otherwise the next run might fly a motion that the server no
-longer expects. If it cannot be saved, because a disk is full, read-only or stuck, the client
-continues after `WAIT_NS`, and each observation says so: the servers then treat a restart of the
-client as one without saved state.
+longer expects. If the state cannot be saved, because a disk is full, read-only or stuck, the client
+continues after `WAIT_NS`, and each observation reports it: the servers then treat a restart of the
+client as a restart without saved state.
 """
 
 from typing import Annotated, Any, Self
@@ -37,10 +37,10 @@ from skytether.shared.wire.protocol import KNOTS_MAX
 TIME_MAX_NS = 2**62
 STEP_MAX = 2**40
 REFRESHES = 3
-"""Number of times that an unchanged state is written again before it would be too old."""
+"""Number of times that an unchanged state is written before the first copy would be too old."""
 WAIT_NS = 500 * MILLISECOND_NS
-"""Longest time for which a client waits for its state to be saved [ns]: less than the silence after
-which it asks a standby server."""
+"""Longest time for which a client waits for its state to be saved [ns]: less than the leader's
+silence after which the client asks a standby server."""
 
 Time = Annotated[int, msgspec.Meta(ge=-TIME_MAX_NS, le=TIME_MAX_NS)]
 """Time on the host's clock [ns]; in the encoded bytes, relative to the time of writing."""
@@ -60,7 +60,7 @@ class FlownMotion(msgspec.Struct, frozen=True, kw_only=True):
         """Knots of the motion; shape (axes, knots, 2).
 
         Raises:
-            ValueError: their size does not fit the number of axes, or one is not finite.
+            ValueError: the size does not fit the number of axes, or a number is not finite.
         """
         count, left = divmod(len(self.numbers), 4 * 2 * axes)
         if left or not 0 < count <= KNOTS_MAX:
@@ -75,7 +75,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
     """State that a client saves for its next run."""
 
     boot_id: int | None = None
-    """Boot id of the conversation with the server; None if the conversation cannot continue."""
+    """Boot id in the session with the server; None if the session cannot continue."""
     began_ns: Time | None = None
     heard_ns: Time = 0
     motion: FlownMotion | None = None
@@ -122,7 +122,7 @@ class SavedState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def recall(content: bytes, written_ns: int | None, now_ns: int, terms: Terms) -> SavedState:
-    """Saved state of an earlier run, as far as it is still valid.
+    """State saved by an earlier run, without the parts that are no longer valid.
 
     A flight is not continued if its state is older than the longest possible motion.
 
@@ -130,7 +130,7 @@ def recall(content: bytes, written_ns: int | None, now_ns: int, terms: Terms) ->
         content: bytes written by that run.
         written_ns: time of writing [ns; the clock of the host]; None if the clock has been
             reset since, for example by a reboot.
-        terms: terms of the flight, which have not changed.
+        terms: terms of the flight; they are the same as in the earlier run.
 
     Raises:
         ValueError: the content is invalid; the message gives the reason.
@@ -162,16 +162,16 @@ class ClientMemory:
         self.boot_id = boot_id if self.before.boot_id is None else self.before.boot_id
         self._age_max_ns = age_max_ns(terms)
         self._handed: tuple[SavedState, int] | None = None
-        """State that was last returned for writing, and the time of its return [ns]."""
+        """State that `keep` last returned for writing, and the time of that call [ns]."""
         self._saved = None if self.before.boot_id is None else self.before
-        """Saved state, which the next run would use; None if no state is saved."""
+        """State on the disk, which the next run would use; None without one."""
         self._is_removed = False
-        """Whether the saved state was removed, because it could not be replaced."""
+        """Whether the state on the disk was removed because it could not be replaced."""
         self._differs_ns: int | None = None
-        """Time of the first change since the state was saved [ns]; None without a change."""
+        """Time since which the state on the disk is out of date [ns]; None if up to date."""
         self.unsaved = False
-        """Whether saving the newest state of `may_tell` has failed, so that the next run lacks
-        it."""
+        """Whether saving the newest state passed to `may_tell` has failed, so that the next run
+        would lack it."""
 
     @property
     def is_stale(self) -> bool:
@@ -179,7 +179,7 @@ class ClientMemory:
         return self._saved is not None and self._differs_ns is not None
 
     def keep(self, state: SavedState, *, now_ns: int) -> bytes | None:
-        """Bytes to be written, if the state has changed or the bytes returned last are old."""
+        """Bytes to be written; None if the bytes returned last are recent and still true."""
         if self._handed is not None:
             handed, handed_ns = self._handed
             is_old = now_ns - handed_ns > self._age_max_ns // REFRESHES
@@ -189,13 +189,13 @@ class ClientMemory:
         return state.encode(now_ns)
 
     def kept(self, *, nothing: bool) -> None:
-        """Note that the bytes returned last were written, or that the file was removed."""
+        """Note that the bytes returned last were written; `nothing`: that the file was removed."""
         self._is_removed = nothing
         self._saved = self._handed[0] if self._handed and not nothing else None
 
     def may_tell(self, state: SavedState, *, now_ns: int) -> bool:
-        """Whether messages may be sent: this state is saved, no older state is saved, or saving
-        has failed, which the messages then report (`unsaved`).
+        """Whether messages may be sent: this state is on the disk, no older state is on the disk,
+        or saving has failed, which the messages then report (`unsaved`).
         """
         if self._saved is not None and _is_same(state, self._saved):
             self._differs_ns, self.unsaved = None, False
@@ -244,15 +244,15 @@ class SavingClient(Client):
         return may_tell
 
     def _report(self, now_ns: int) -> None:
-        # Nothing is sent before the state is saved, or the disk has failed: otherwise the server
-        # would not know which motion the next run flies.
+        # Nothing is sent before the state is saved or saving has failed: otherwise the server would
+        # not know which motion the next run flies.
         may_tell = self._may_tell(now_ns)
         self.waits_for_disk = self._memory.is_stale
         if may_tell:
             super()._report(now_ns)
 
     def _state(self) -> SavedState:
-        """State to save; before the flight has begun, that of the previous run."""
+        """State to save; before the flight has begun, the state of the previous run."""
         pilot, always = self._pilot, {"frame": self._flies.frame} | self._servers.to_keep()
         if pilot.next_ns is None:
             return msgspec.structs.replace(self._memory.before, **always)
@@ -267,7 +267,7 @@ class SavingClient(Client):
 
 
 def _is_same(one: SavedState, other: SavedState) -> bool:
-    """Whether two states are equal for the next run: times that only advance are ignored."""
+    """Whether two states mean the same to the next run: times that only advance are ignored."""
     return _compared_part(one) == _compared_part(other)
 
 

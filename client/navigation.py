@@ -33,7 +33,7 @@ from skytether.shared.wire.protocol import FLOAT_MAX
 CARRIED_NS = SECOND_NS // 2
 """Longest time over which a measurement is extrapolated, even if the measurement is older."""
 SIGMAS = 10.0
-"""Standard deviations of sensor noise by which two measurements may differ without counting as a
+"""Number of standard deviations of sensor noise by which two measurements may differ without a
 leap."""
 
 
@@ -80,7 +80,7 @@ class Navigation:
             else load("skytether.client.unfiltered", "sensor.filter").Newest(axes)
         )
         self._inputs: Any = None
-        """`PendingInputs` that do not act yet; None if the model has no dead time."""
+        """Inputs that do not act yet (`PendingInputs`); None if the model has no dead time."""
         if any(terms.dead_time_s):
             late = rooms.dead_time()
             self._inputs = late.PendingInputs(terms.model.axes(), late.dead_times(terms))
@@ -90,8 +90,8 @@ class Navigation:
         self._begun = False
         self.leaps = Leaps(scenario)
         self.leapt = False
-        """Whether a measurement since the last step is farther away than any vehicle could have
-        moved."""
+        """Whether a measurement since the last step differs from the previous one by more than any
+        vehicle could have moved."""
         self._nothing = np.full((2, axes), math.nan)
         self.measured: Array = np.full((axes, 2), math.nan)
         """Measurements since the last step, position [m] and velocity [m/s] of each axis, NaN if
@@ -103,14 +103,14 @@ class Navigation:
         """State in which the next input will take effect, used by feedback and in observations;
         equal to the estimate without a dead time."""
         self.is_known = False
-        """Whether the estimate is finite, also as float32."""
+        """Whether the predicted state is finite, also as float32."""
 
     def advance(self, measurements: Sequence[Measurement], command: Array, *, now_ns: int) -> None:
-        """Advance to a step; before the first step the vehicle is at rest.
+        """Advance to a step; the filter starts at the first position, with a vehicle at rest.
 
         Args:
             measurements: measurements that became available since the previous step.
-            command: input flown since then [m/s]; shape (axes,).
+            command: input flown since the previous step [m/s]; shape (axes,).
             now_ns: start of the step [ns; the client's clock].
         """
         due, swing = command, None
@@ -150,10 +150,10 @@ class Navigation:
         return self.filter.disturbance()
 
     def _carried(self, measured: Measurement, to_ns: int, due: Array) -> Measurement:
-        """Measurement extrapolated by the model to a later time; unchanged for an earlier time.
+        """Measurement extrapolated by the model to a later time; unchanged if the time is earlier.
 
-        A real vehicle measures between steps. If an older input than `due` acted during part of the
-        extrapolation, the filter has to correct the difference.
+        A real vehicle measures between steps. The extrapolation assumes the input `due`; if another
+        input acted during part of it, the filter corrects the error.
 
         Args:
             measured: the measurement.
@@ -178,10 +178,10 @@ class Navigation:
 
 
 def _newest(measurements: Sequence[Measurement]) -> Sequence[Measurement]:
-    """Measurements from the newest position on, from which the filter starts.
+    """Newest measurement with a position, and all later ones: the filter starts from these.
 
     Before the first step somebody else flew the vehicle, such as the autopilot during its climb.
-    With our inputs the filter would interpret that motion as a disturbance.
+    The filter, which knows only the client's inputs, would see that motion as a disturbance.
     """
     placed = [i for i, measurement in enumerate(measurements) if measurement.position is not None]
     return measurements[placed[-1] :] if placed else ()
@@ -193,8 +193,8 @@ class Leaps:
     def __init__(self, scenario: Scenario) -> None:
         sensor = scenario.sensor
         self.off_m: list[float] = []
-        """Distance of the newest position from the nearest reachable one, on each axis [m]; empty
-        unless the position has leapt."""
+        """Distance of the newest position from the position that the velocities predict, on each
+        axis [m]; empty unless the position has leapt."""
         self._noise_m = NOISE_M + SIGMAS * sensor.position_noise_m
         self._noise_mps = NOISE_MPS + SIGMAS * sensor.velocity_noise_mps
         self._position = self._velocity = np.full(scenario.model.axes, math.nan)
@@ -202,11 +202,11 @@ class Leaps:
         self._position_ns = self._velocity_ns = 0
 
     def leaps(self, measured: Measurement, numbers: Array) -> bool:
-        """Store a measurement; return whether it is farther away than any vehicle could have moved.
+        """Store a measurement; return whether no vehicle could have moved to it since the last one.
 
         Args:
             measured: the measurement.
-            numbers: its positions and velocities, NaN if missing; shape (2, axes).
+            numbers: its positions [m] and velocities [m/s], NaN if missing; shape (2, axes).
         """
         stamp_ns, position, velocity = measured
         p, v = self._position, self._velocity
@@ -219,7 +219,7 @@ class Leaps:
             off_m = [displacement(*last_ns, time_p) for last_ns in moves]
             if any(abs(off) > most_m(time_p, self._noise_m) for off in off_m):
                 self.off_m = off_m
-        # Stored even after a leap: otherwise all later measurements would count as leaps, too.
+        # Also stored after a leap: otherwise all later measurements would count as leaps, too.
         if position is not None:
             self._position, self._position_ns = numbers[0], stamp_ns
         if velocity is not None:
@@ -246,11 +246,11 @@ def has_leapt(
     noise_m: float,
     noise_mps: float,
 ) -> bool:
-    """Whether a measurement is farther away than any vehicle could have moved; False for NaN.
+    """Whether no vehicle could have moved to a measurement since the last one; False for NaN.
 
     Args:
         position, velocity: previous measurement of each axis [m], [m/s].
-        measured: new positions and velocities; shape (2, axes).
+        measured: new positions [m] and velocities [m/s]; shape (2, axes).
         time_p, time_v: time since the previous position and velocity [s].
         noise_m, noise_mps: change that noise alone may cause [m], [m/s].
     """

@@ -1,7 +1,7 @@
 """Orders of an operator in flight: keys of the scenario that may change while a vehicle flies.
 
-`armed` allows plans to be flown, and `vehicle.after_leap` chooses the frame after a leap of the
-position. Servers and vehicles define further keys.
+`armed` allows plans to be flown. After a leap of the position, `vehicle.after_leap` decides whether
+the old or the new position is right. Servers and vehicles define further keys.
 """
 
 from operator import attrgetter
@@ -19,7 +19,7 @@ ARMED = keys_of(InFlight.ARMED)
 """Key with which an operator allows plans to be flown."""
 AFTER_LEAP = "vehicle.after_leap"
 LEAP = keys_of(InFlight.LEAP)
-"""Key with which an operator chooses the frame to use after a leap of the position."""
+"""Key with which an operator decides which position is right after a leap."""
 
 
 class Orders:
@@ -34,7 +34,7 @@ class Orders:
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         """Why an order is refused at present; empty if it is accepted.
 
-        After a leap, the operator has to choose the frame in order to arm the vehicle.
+        After a leap, an order that arms the vehicle also has to decide which position is right.
         """
         if keys & self._servers.keys and (objection := self._servers.objection(scenario)):
             return objection
@@ -53,7 +53,7 @@ class Orders:
         return self._flies.objection(scenario, keys)
 
     def obey(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:
-        """Act on an order; `keys` have new values, which `scenario` contains."""
+        """Act on an order: `keys` have new values in `scenario`."""
         self._failsafe.armed = scenario.armed
         if keys & ARMED and scenario.armed:
             self._flies.arm()

@@ -22,8 +22,8 @@ class SeveralPaths(Route):
 
     Args:
         events: list to which events for the operator are appended.
-        names: name of each path in the log; its address unless given.
-        prices: price of a packet on each path.
+        names: name of each path in the log; empty: the addresses are the names.
+        prices: price of a packet on each path; only their ratios matter.
         spread: `link.spread`.
         timeout_ns: time without a packet after which an end considers the link lost [ns].
     """
@@ -48,7 +48,7 @@ class SeveralPaths(Route):
         self._paths: Paths | None = None
         """State of the paths in the present session; None before the first session."""
         self._proofs: dict[int, int] = {}
-        """Number in the server's newest request for a proof of each path."""
+        """Number to return as the proof of each path, from the server's newest request, by path."""
         self._greeted = 0
         """Path of the next HELLO."""
 
@@ -80,7 +80,7 @@ class SeveralPaths(Route):
         return True
 
     def watch(self, session: Conversation, now_ns: int) -> None:
-        """Send the newest packet again if it was lost, and probe paths with few measurements."""
+        """Repeat the newest packet if it was lost; probe paths; log paths that died or healed."""
         if self._paths is None:
             return
         if resent := self._paths.again(session.hearing.silence_ns, now_ns, self._all):
@@ -101,7 +101,7 @@ class SeveralPaths(Route):
         return {"paths": self._paths.figures(now_ns)} if self._paths else {}
 
     def _name(self, session: Conversation, path: int, now_ns: int) -> None:
-        """Send a PATH message, which names a path."""
+        """Send a PATH message on a path: its number, the proof, and the prices of all paths."""
         if session.number is not None and self._paths:
             least, proof = min(self._prices), self._proofs.get(path, 0)
             prices = tuple(round(1000 * price / least) for price in self._prices)

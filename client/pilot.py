@@ -1,8 +1,8 @@
 """Pilot: flies the chosen input at every step, and records the step.
 
-The client's clock is the flight's clock: the epoch is the time at which the session opened, step k
-begins at epoch + k Δt, and all time stamps used for control are taken here. `client.failsafe`
-decides what the vehicle may do, `client.compensator` which input of a horizon it flies, and
+The client's clock is the flight's clock: the epoch is the time at which the flight began, step k
+begins at epoch + k Δt, and all time stamps used for control are on this clock. `client.failsafe`
+decides what the vehicle may do, `client.compensator` computes the input from the plan, and
 `client.clamp` bounds that input.
 """
 
@@ -43,15 +43,15 @@ LAND_MPS = 0.5
 STOPPED = (Mode.FAULT, Mode.MANUAL)
 """Modes in which the input becomes zero at once, without braking."""
 HOVERING = frozenset({Mode.INIT, Mode.SYNC, Mode.READY, Mode.HOVER, Mode.LAND})
-"""Modes in which a vehicle holds its position, or descends from it."""
+"""Modes in which a vehicle holds its position, or lands there."""
 UNPLACED = frozenset({Reason.MUTE, Reason.UNUSABLE, Reason.ASTRAY})
-"""Reasons for hovering with which the vehicle's position is unknown."""
+"""Reasons for hovering that mean that the vehicle's position is unknown."""
 IMPOSSIBLE = frozenset({Drop.FROM_THE_FUTURE, Drop.OBSERVATION})
-"""Reasons for dropping a horizon from the future."""
+"""Reasons for dropping a plan that was made for, or from, a step in the future."""
 
 
 class Pilot:
-    """Flies one vehicle, with or without a horizon."""
+    """Flies one vehicle, with or without a plan."""
 
     def __init__(
         self,
@@ -65,15 +65,15 @@ class Pilot:
         self._dt_ns, self._keeps_apart = self._terms.dt_ns, scenario.keeps_apart
         self._splines = self._terms.splines
         self._late = LATE_SHARE * self._terms.reach
-        """Number of past steps of a horizon above which it counts as late."""
+        """A plan counts as late if more than this number of its steps has passed."""
         self.steps = scenario.steps
         self._number, self._vehicle = number, vehicle
         self._navigation = Navigation(scenario)
         self._failsafe = failsafe
         self._recorder = recorder
         self._holds = scenario.keeps_apart or (vehicle.drifts and failsafe.brakes)
-        """Whether a hovering vehicle holds its position: zero velocity alone would let it drift,
-        and other vehicles of a mission avoid only that position."""
+        """Whether a hovering vehicle holds its position by feedback. A commanded velocity of zero
+        would let it drift, but other vehicles of a mission avoid only that position."""
         along = regulator(scenario) if self._splines or self._holds else None
         self.compensator = Compensator(self._terms, along)
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
@@ -97,8 +97,8 @@ class Pilot:
         """Present step; measurements up to its start are included."""
         self._flown_ns = 0
         self._takes_from: int | None = None
-        """Step of the first observation that announced that horizons are accepted; None while
-        they are refused."""
+        """Step of the first observation that announced that plans are accepted; None while plans
+        are refused."""
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._speed = 0.0
@@ -108,11 +108,11 @@ class Pilot:
         """Step after the last step with a planned input."""
         self.missed = 0
         self.late_ns = self.latest_ns = 0
-        """Time by which the present step began late, and the largest so far [ns]."""
+        """Lateness of the present step, and the largest lateness so far [ns]."""
         self.transitions: list[Transition] = []
-        """Transitions of the failsafe on which the pilot has acted, to be reported."""
+        """Transitions of the failsafe on which the pilot has acted; the log reports them."""
         self.leap_m: tuple[float, ...] | None = None
-        """Leap about which the operator has not decided: displacement on each axis [m], or empty if
+        """Leap about which no operator has decided yet: displacement on each axis [m], empty if
         only the velocity has leapt. None without a leap."""
 
     @property
@@ -132,7 +132,7 @@ class Pilot:
         return self._epoch_ns + step * self._dt_ns
 
     def begin(self, *, now_ns: int, began_ns: int | None = None) -> None:
-        """Begin the flight, or continue that of an earlier run whose step 0 began at `began_ns`."""
+        """Begin the flight, or continue an earlier run's: `began_ns` is the start of step 0."""
         if began_ns is None:
             self._epoch_ns = self.next_ns = now_ns
             self._navigate(0)
@@ -143,25 +143,25 @@ class Pilot:
         if self._goes_on(self.step):
             self.steps = max(self.steps, self.compensator.last_step + 1)
 
-    # -- horizons ----------------------------------------------------------------------------
+    # -- plans -------------------------------------------------------------------------------
 
     def offer(self, horizon: Horizon | Trajectory, *, now_ns: int) -> None:
-        """Put a horizon in force if it is the newest and may be flown.
+        """Put a plan in force if it is the newest plan and may be flown.
 
-        A horizon that was planned before the server knew that horizons are accepted is dropped: it
-        does not start at the vehicle's position.
+        A plan made before the server knew that plans are accepted is dropped, because it does not
+        start at the vehicle's position.
 
         Raises:
-            ProtocolError: the horizon is dropped.
+            ProtocolError: the plan is dropped.
         """
         if self._failsafe.transitions:
             self.obey()
         terms = self._terms
-        # An overtaken horizon is always late, and says nothing about the newest one's delay.
+        # An overtaken plan is always late, and shows nothing about the delay of the newest plan.
         if horizon.step > self.compensator.newest:
             passed = self.step - horizon.step
             if isinstance(horizon, Horizon):
-                # The first inputs are committed, and usually flown before the horizon arrives.
+                # The first inputs are committed: usually their steps are over on arrival.
                 passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > self._late, now_ns=now_ns)
         observed = horizon.step - horizon.age
@@ -204,7 +204,7 @@ class Pilot:
         return self._goes_on(self.step)
 
     def rest(self, *, now_ns: int) -> int:
-        """Accept no further motion; returns the time by which the vehicle is at rest [ns]."""
+        """Accept no further motion; return the time by which the vehicle is at rest [ns]."""
         self._failsafe.meet(Reason.OVER, now_ns=now_ns)
         last = self.compensator.last_step
         return self.starts_ns(last) if self._goes_on(self.step) else now_ns
@@ -225,17 +225,17 @@ class Pilot:
         transitions.clear()
 
     def _drop(self) -> None:
-        """Drop the horizon, or stop holding a position, and brake from the present input."""
+        """Drop the plan, or stop holding a position, and brake from the present input."""
         self.compensator.drop(self.step - 1, self._input)
         self._speed = math.hypot(*self._input.tolist())
 
     # -- steps -------------------------------------------------------------------------------
 
     def fly(self, *, now_ns: int) -> None:
-        """Advance to the present step; the old input was flown during missed steps."""
+        """Fly the present step; during missed steps the vehicle went on with the previous input."""
         assert self._epoch_ns is not None
         assert self.next_ns is not None
-        # A client delayed beyond the end of its flight still flies the last step.
+        # A client that wakes after the end of its flight still flies the last step.
         present = min((now_ns - self._epoch_ns) // self._dt_ns, self.steps - 1)
         self.missed += present - self.step
         # Missed steps are navigated one by one: the filter predicts one step at a time.
@@ -285,7 +285,7 @@ class Pilot:
         if failsafe.transitions:
             self.obey()
         if self.step == self.steps - 1 and self._goes_on(self.step):
-            # A flight that ends before the motion's last knot is prolonged to it.
+            # A flight whose last step is before the motion's last knot is prolonged to that knot.
             failsafe.meet(Reason.OVER, now_ns=now_ns)
             self.steps = self.compensator.last_step + 1
         if not navigation.is_known:
@@ -302,11 +302,11 @@ class Pilot:
             self.obey()
 
     def _compose_input(self) -> tuple[list[float], float, bool]:
-        """Input of the present step: the compensator's, bounded by mode, clamp and fence.
+        """Input of the present step: the compensator's input, bounded by mode, clamp and fence.
 
         Returns:
-            input of each axis [m/s]; speed that counts for the braking curve [m/s]; and whether the
-            compensator's input is finite, otherwise the input is zero.
+            input of each axis [m/s]; speed from which the braking curve goes on [m/s]; and whether
+            the compensator's input is finite: if not, the returned input is zero.
         """
         mode, terms, compensator = self._failsafe.mode, self._terms, self.compensator
         navigation, had_plan = self._navigation, compensator.covered
@@ -334,8 +334,8 @@ class Pilot:
         )
         if flown is None or mode in STOPPED:
             return [0.0] * terms.axes, 0.0, flown is not None
-        # The braking curve applies to the input without feedback; feedback is bounded by u_max
-        # alone (docs/failsafe.md). The fence's correction is excluded too: it may last for ever.
+        # The braking curve bounds the input without feedback; only u_max bounds the feedback
+        # (docs/failsafe.md). The fence's correction does not count, either: it may never end.
         speed = min(math.hypot(*without_feedback), speed_max) if feeds_back else math.hypot(*flown)
         if self._fence is not None:
             within = self._fence.limited(flown, navigation.predicted.tolist(), terms.u_max)
@@ -345,7 +345,7 @@ class Pilot:
         return flown, speed, True
 
     def _rest(self) -> None:
-        """Hold the position at which a vehicle that hovers without a plan comes to rest."""
+        """Let a vehicle that hovers without a plan hold the position at which it comes to rest."""
         if self._is_to_rest() and self._navigation.is_known:
             place = self._navigation.predicted.copy()
             if not self._keeps_apart:
@@ -357,7 +357,7 @@ class Pilot:
         is_free = compensator.in_force == NO_HORIZON and not compensator.rests
         if not is_free:
             return False
-        # After a change of the frame, the estimate is in the old frame until a position arrives.
+        # After a change of frame the estimate is in the old frame until a new position arrives.
         is_measured = bool(np.isfinite(self._navigation.measured[:, 0]).all())
         return is_measured and (self._keeps_apart or failsafe.reason not in UNPLACED)
 
@@ -439,7 +439,7 @@ class Pilot:
         )
 
     def figures(self) -> dict[str, Any]:
-        """Figures of the flight so far; ages are only given while a horizon is in force."""
+        """Figures of the flight so far; they include ages only while a plan is in force."""
         figures: dict[str, Any] = {
             "mode": str(self._failsafe.mode),
             "step": self.step,

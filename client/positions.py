@@ -1,4 +1,4 @@
-"""Measurements of an autopilot or a robot, converted to the client's clock, in order, each once."""
+"""Measurements of an autopilot or a robot on the client's clock, in order and without repeats."""
 
 import math
 from collections import Counter, deque
@@ -13,19 +13,19 @@ from skytether.shared.scenario.reference import FAR_M
 from skytether.shared.scenario.schema import Scenario
 
 WAITING_MAX = 64
-"""Number of measurements waiting to be read; the oldest are dropped."""
+"""Largest number of measurements that wait to be read; older ones are dropped."""
 AHEAD_NS = 20 * MILLISECOND_NS
 """Time by which a stamp may lie in the future because of clock errors; stamps further ahead are
 dropped."""
 OLD_NS = SECOND_NS
 """Largest age of a measurement that is used, for an autopilot aboard."""
 RECALLED_MAX_NS = 600 * SECOND_NS
-"""Longest time for which an origin saved by an earlier run is valid."""
+"""Longest time for which an origin saved by an earlier run stays valid."""
 REBOOT_NS = SECOND_NS
-"""Allowed difference of the two clocks' elapsed times since the origin was saved, in addition to
-drift."""
+"""Allowed difference between the times that have passed on the autopilot's and the host's clock
+since the origin was saved, in addition to their drift."""
 DRIFT_PARTS = 40
-"""Inverse of the allowed drift of the two clocks since the origin was saved: 2.5 %."""
+"""Inverse of the allowed drift of these two clocks: 1/40 = 2.5 %."""
 SPEED_MAX = 1e3
 """Largest speed on an axis that is accepted [m/s]."""
 
@@ -43,7 +43,7 @@ Vector = tuple[float, float, float]
 
 
 def take_off_place(scenario: Scenario, vehicle: int) -> Vector:
-    """Position of take-off, in our axes [m]; on a mission, below the vehicle's start position."""
+    """Position of take-off in the scenario's frame [m]; on a mission, below the vehicle's start."""
     if not scenario.keeps_apart:
         return 0.0, 0.0, 0.0
     x, y = scenario.start_m(vehicle)[:2].tolist()
@@ -57,10 +57,10 @@ class Positions:
         axes: number of axes that are flown, 2 or 3.
         clock: the autopilot's clock.
         old_ns: age above which a measurement is dropped [ns].
-        start: position of take-off in our axes, used by `begin` [m].
-        origin: origin of the scenario's frame in the autopilot's local frame, in our axes [m];
-            None if known only after `begin`.
-        leaps: check of each measurement against the previous one; None: unchecked.
+        start: position of take-off in the scenario's frame, used by `begin` [m].
+        origin: origin of the scenario's frame in the autopilot's local frame, z up [m]; None if
+            `begin` sets it.
+        leaps: leap detection; None: leaps are not detected.
     """
 
     def __init__(
@@ -81,23 +81,23 @@ class Positions:
         self.is_flown = False
         """Whether the pilot flies by these measurements, so that a leap matters."""
         self.leap_m: Vector | None = None
-        """Displacement of the position about which the operator has not decided, in our axes [m];
-        None without a leap. The origin has been displaced by the same vector, so the vehicle keeps
-        its old frame."""
+        """Displacement of the position about which no operator has decided yet, z up [m]; None
+        without a leap. The origin has been displaced by the same vector, so the vehicle keeps its
+        old frame."""
         self._jumps = 0
         self.origin: Vector = origin or (0.0, 0.0, 0.0)
-        """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]."""
+        """Origin of the scenario's frame in the autopilot's local frame, z up [m]."""
         self.has_origin = origin is not None
         self.is_recalled = False
         """Whether the origin was saved by an earlier run since this boot of the autopilot."""
         self._recalled: VehicleMemory | None = None
-        """State saved by an earlier run, until it is clear whether it is from this boot."""
+        """State saved by an earlier run, until it is checked for a reboot of the autopilot."""
         self._boot_ns = 0
-        """Time of the newest measurement since the autopilot's boot [ns]."""
+        """Time from the autopilot's boot to the newest measurement that was used [ns]."""
         self.position: Vector | None = None
-        """Newest position in the autopilot's local frame, in our axes [m]."""
+        """Newest position in the autopilot's local frame, z up [m]."""
         self.velocity: Vector = (0.0, 0.0, 0.0)
-        """Newest velocity, in our axes [m/s]."""
+        """Newest velocity, z up [m/s]."""
         self.came_ns: int | None = None
         """Arrival of the newest measurement that was used [ns]."""
         self.heard_ns: int | None = None
@@ -118,7 +118,7 @@ class Positions:
         return self.position[2] - self.origin[2] if self.position else 0.0
 
     def take_in(self, boot_ns: int, position: Vector, velocity: Vector, *, now_ns: int) -> None:
-        """Process a position and a velocity measured at a time since boot, in our axes [m, m/s]."""
+        """Process a position [m] and a velocity [m/s], z up, measured at a time since boot [ns]."""
         self.heard_ns = now_ns
         self._fault = reason = self._wrong(boot_ns, position, velocity, now_ns)
         if reason:
@@ -128,7 +128,7 @@ class Positions:
         if self._recalled is not None:
             self._recall(self._recalled, now_ns)
         stamp_ns = min(self._clock.local_ns(boot_ns), now_ns)
-        if self._newest_ns is not None:  # a correction of the clock must not reverse the order
+        if self._newest_ns is not None:  # a corrected clock must not reverse the order
             stamp_ns = max(stamp_ns, self._newest_ns + 1)
         self._newest_boot_ns, self._newest_ns = boot_ns, stamp_ns
         self.position, self.velocity = position, velocity
@@ -142,15 +142,15 @@ class Positions:
         )
 
     def _watch(self, leaps: Leaps, measured: Measurement) -> None:
-        """After a leap of the position, displace the origin by the same vector: no vehicle can have
-        moved that far.
+        """Detect a leap of the position, and then displace the origin by the same vector: no
+        vehicle can have moved that far.
         """
         if leaps.leaps(measured, measured.numbers()) and leaps.off_m and self.is_flown:
             dx, dy, dz = leaps.off_m
             self.displace((dx, dy, dz))
 
     def displace(self, by_m: Vector, *, asks: bool = True) -> None:
-        """Displace the origin together with the position; with `asks` an operator has to decide."""
+        """Displace the origin by a leap of the position; `asks`: an operator then has to decide."""
         dx, dy, dz = by_m
         (x, y, z), before = self.origin, self.leap_m or (0.0, 0.0, 0.0)
         self.origin = x + dx, y + dy, z + dz
@@ -158,7 +158,7 @@ class Positions:
             self.leap_m = before[0] + dx, before[1] + dy, before[2] + dz
 
     def decide(self, *, keeps_frame: bool) -> None:
-        """Keep the old frame permanently, or use the new one from now on."""
+        """Keep the old frame for good, or use the new frame: undo the displacement."""
         if self.leap_m is not None and not keeps_frame:
             pairs = zip(self.origin, self.leap_m, strict=True)
             x, y, z = (zero - leapt for zero, leapt in pairs)
@@ -189,7 +189,7 @@ class Positions:
         return "late" if boot_ns < self._newest_boot_ns else ""
 
     def begin(self) -> None:
-        """Set the scenario's origin: the present position minus the scenario's start."""
+        """Set the scenario's origin such that the vehicle is now at `start`."""
         if self.position is not None:
             x, y, z = (at - start for at, start in zip(self.position, self._start, strict=True))
             self.place((x, y, z))
@@ -199,7 +199,7 @@ class Positions:
         self._waiting.clear()
 
     def recall(self, saved: VehicleMemory) -> None:
-        """Restore the origin saved by an earlier run, once it proves to be from this boot."""
+        """Restore an earlier run's origin once the autopilot proves not to have rebooted."""
         if not self.has_origin and saved.origin is not None:
             self._recalled = saved
 
@@ -218,7 +218,7 @@ class Positions:
 
     @property
     def _boot_ms(self) -> int:
-        """Time of the newest measurement since boot, modulo 2^32 as in MAVLink [ms]."""
+        """Time from boot to the newest measurement used, modulo 2^32 as in MAVLink [ms]."""
         return self._boot_ns // MILLISECOND_NS % 2**32
 
     def frame(self, *, armed: bool) -> VehicleMemory:

@@ -1,4 +1,4 @@
-"""Further policies of `vehicle.report`, see `reports`."""
+"""Policies of `vehicle.report` other than `silence`, see `client.reports`."""
 
 from typing import Annotated
 
@@ -23,7 +23,7 @@ def periodic(now: Unreported, N: Annotated[int, Meta(ge=1, le=PERIOD_MAX)]) -> b
 @REPORTS
 def deviation(now: Unreported, metres: Annotated[float, Meta(ge=0, le=1e9)]) -> bool:
     """Sends if the vehicle is more than `metres` away from the state that the server predicts, if
-    another horizon has come into force or the same one was received again, or if its mode has
-    changed.
+    another horizon has come into force or the same horizon was received again, or if the vehicle's
+    mode has changed.
     """
     return now.is_news or now.off_m > metres

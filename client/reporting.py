@@ -1,9 +1,9 @@
-"""Reports of the vehicle's state: the server's prediction of it, and the decision to send an
-observation.
+"""Reports of the vehicle's state: the decision to send an observation, by comparison with the
+server's prediction.
 
 The server predicts the state from the newest observation by the rule of flight (`shared.law.rule`).
-The vehicle computes the same prediction from its last observation and the horizon in force. While
-the prediction is close to the real state, the server needs no observation.
+The vehicle computes the same prediction from its last observation and the plan in force. While the
+prediction is close to the real state, the server needs no observation.
 """
 
 import math
@@ -18,8 +18,8 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.wire.protocol import Mode
 
 RETRY_STEPS = 4
-"""Number of steps after which a vehicle that waits for its first horizon reports again. The
-interval then doubles, so that a long wait costs few packets."""
+"""Number of steps after which a vehicle that waits for its first plan reports again. The interval
+then doubles, so that a long wait costs few packets."""
 
 
 @compilable
@@ -42,7 +42,7 @@ class Reporter:
 
     Args:
         report: `vehicle.report`.
-        compensator: contains the horizon in force, which gave the input of the step.
+        compensator: has the plan in force, which gave the input of the step.
     """
 
     def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:
@@ -51,16 +51,16 @@ class Reporter:
         self.always = is_always(report)
         self._wants = make_report(report)
         self.believed = np.zeros((terms.axes, 2))
-        """State at the next step that the server predicts if no packet is lost, position [m] and
+        """State that the server predicts for the next step if no packet is lost: position [m] and
         velocity [m/s] of each axis; shape (axes, 2)."""
         self._session: int | None = None
         """Session of the newest observation; None before the first."""
         self._reported: tuple[int, Mode, int] | None = None
-        """Horizon in force, mode and number of repeated horizons, as in the newest observation."""
+        """Plan in force, mode, and number of repeats of plans, at the newest observation."""
         self._reported_step, self._step = 0, 0
         """Step of the newest observation, and latest step for which `is_due` was called."""
         self._ready: int | None = None
-        """Step since which the vehicle waits for a horizon; None while it does not wait."""
+        """Step since which the vehicle waits for a plan; None while it does not wait."""
 
     def is_due(
         self,
@@ -71,8 +71,8 @@ class Reporter:
         flown: Array,
         silence: int,
     ) -> bool:
-        """Whether to send an observation of this step. Called once a step; after True, the
-        observation counts as sent.
+        """Whether to send an observation of this step. Called at most once a step; if the result is
+        True, the observation counts as sent.
 
         Args:
             session: number of the session.
@@ -82,7 +82,7 @@ class Reporter:
             flown: input flown from this step on, of each axis [m/s].
             silence: longest silence that the server allows [half steps]; 0 for no bound.
         """
-        if self.always:  # the report's policy needs no prediction
+        if self.always:  # this policy needs no prediction
             return True
         situation = self._compensator.in_force, mode, self._compensator.repeated
         slept = step > self._step + 1
@@ -101,11 +101,11 @@ class Reporter:
         return due
 
     def _waits(self, step: int, mode: Mode) -> bool:
-        """Whether a vehicle that waits for a horizon reports now, for the first time or again.
+        """Whether a vehicle that waits for a plan reports now, for the first time or again.
 
         The server plans only for a vehicle that has reported that it is ready. Without these
-        reports, a vehicle that reports every 4 s began to fly up to 4 s late, and 8 s if one packet
-        was lost.
+        reports, a vehicle that reports every 4 s began to fly up to 4 s late, and up to 8 s if one
+        packet was lost.
         """
         if mode is not Mode.READY:
             self._ready = None

@@ -1,6 +1,6 @@
 """Policies of `vehicle.report`, which decide when the vehicle sends an observation.
 
-They are combined with & and | like a trigger's policies (`shared.scenario.grammar`), and
+Policies are combined with & and | as in a trigger (`shared.scenario.grammar`), and
 `client.reporting` evaluates them aboard, once per step. Two observations are sent in any case: the
 first of a session, and one after the longest silence that the server allows.
 """
@@ -15,15 +15,14 @@ from skytether.shared.scenario.registry import REPORTS
 
 
 class Unreported(Struct, frozen=True):
-    """Input of a policy, at one step: the deviation of the server's prediction from the vehicle."""
+    """Input of a policy at one step: changes since the last observation, unknown to the server."""
 
     off_m: float
     """Distance of the vehicle from the state that the server predicts [m], see
     `client.reporting.distance_m`."""
     is_news: bool
-    """Whether, since the last observation, another horizon has come into force, the mode has
-    changed, or the horizon in force was received again, so that its acknowledgement may have been
-    lost."""
+    """Whether, since the last observation, another plan has come into force, the mode has changed,
+    or the plan in force was received again, so that its acknowledgement may have been lost."""
     steps: int
     dt_s: float
 
@@ -43,7 +42,7 @@ def is_always(text: str) -> bool:
 
 
 def make_report(text: str) -> Report:
-    """Function for a text of `vehicle.report`, which must be valid."""
+    """Function that evaluates a valid text of `vehicle.report`."""
 
     def make(expression: Expression) -> Report:
         if isinstance(expression, Combination):

@@ -1,4 +1,4 @@
-"""The route from a vehicle to a server over one link; `client.paths` replaces it for several."""
+"""The route from a vehicle to a server over one link; with several paths see `client.paths`."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Protocol
@@ -39,12 +39,12 @@ class Route:
 
     @property
     def others(self) -> tuple[str, ...]:
-        """All addresses except the first, as texts."""
+        """All addresses except the first, as text."""
         return tuple(address_text(*each) for each in self.addresses[1:])
 
     @property
     def ends(self) -> Iterable[tuple[int, Address]]:
-        """Socket and peer of each address."""
+        """Number of the socket, and address, of each path."""
         return zip(self._sockets, self.addresses, strict=False)
 
     def put(self, datagram: bytes, path: int = 0) -> None:
@@ -64,16 +64,16 @@ class Route:
         """Begin a new session."""
 
     def is_copy(self, datagram: bytes, path: int) -> bool:
-        """Whether the same datagram has arrived before."""
+        """Whether the same datagram has already arrived, for example on another path."""
         return False
 
     def heard(
         self, report: Report, message: Message, datagram: bytes, path: int, now_ns: int
     ) -> None:
-        """Note a loss report that preceded a message of the session in its datagram."""
+        """Note the loss report at the beginning of a datagram of the session."""
 
     def take(self, session: Conversation, message: Message, path: int, now_ns: int) -> bool:
-        """Process a message about paths; False if it is another message."""
+        """Process a message about paths; False if the message is about something else."""
         return False
 
     def watch(self, session: Conversation, now_ns: int) -> None:

@@ -2,12 +2,12 @@
 
 A handshake is one attempt with one ephemeral key. Its INITIATION is repeated with the newest cookie
 until the resulting WELCOME is adopted, or for ATTEMPT_NS. An answer that belongs to no open attempt
-is dropped: otherwise an attacker could open a channel a second time and reset its counters.
+is dropped: otherwise an attacker could open the same channel again and reset its counters.
 
-An attacker who copies an INITIATION to the server from another address receives a cookie valid for
-that address only, and may forward it to the vehicle, which cannot distinguish it from its own. So
-the vehicle tries each cookie at once and never relies on a single one, but tries each no more often
-than it sends HELLOs.
+An attacker who copies an INITIATION to the server from another address receives a cookie that is
+valid for that address only. If the attacker forwards this cookie, the vehicle cannot distinguish it
+from its own. So the vehicle tries each cookie at once and never relies on a single cookie, but
+tries the same cookie no more often than it sends HELLOs.
 """
 
 from collections.abc import Callable
@@ -60,7 +60,7 @@ class SecureLink:
         self._cookie = NO_COOKIE
         """Newest cookie, also from earlier attempts."""
         self._answers: list[bytes] = []
-        """INITIATIONs to be sent in answer to CHALLENGEs."""
+        """INITIATIONs to be sent, which answer CHALLENGEs."""
         self._attempt: _Attempt | None = None
         self._candidate: Channel | None = None
         self._current: Channel | None = None
@@ -73,8 +73,8 @@ class SecureLink:
         # a nonce.
         if attempt is None or attempt.hello != payload or now_ns - attempt.began_ns > ATTEMPT_NS:
             key, private = self._key, self._entropy(KEY_BYTES)
-            # Padded to the length of the longest answer, so that the server cannot be used for
-            # amplification.
+            # Padded to the length of the longest answer, so that an attacker cannot use the server
+            # for amplification.
             noise = Initiator(key.psk, prologue(key), private, pad(payload))
             self._attempt = attempt = _Attempt(noise, payload, now_ns)
             self._candidate = None
@@ -110,12 +110,12 @@ class SecureLink:
         assert self._candidate is not None
         if self._current is not None:
             self._current.retire(now_ns=now_ns)
-        # Packets that the server sent before it used the new channel are still in flight.
+        # The old channel is kept for packets that the server sent before it used the new channel.
         self._previous, self._current = self._current, self._candidate
         self._attempt = self._candidate = None
 
     def wants_hello(self, now_ns: int) -> bool:
-        """Whether the channel is due for replacement; False if there is none."""
+        """Whether the channel is due for replacement; False without a channel."""
         return self._current is not None and self._current.wants_successor(now_ns)
 
     def _data(self, packet: bytes, now_ns: int) -> bytes:

@@ -1,8 +1,8 @@
 """The server's clock as estimated by a vehicle from the time stamps of the server's packets.
 
-The newest packet is echoed in observations, from which the server estimates the delays. A packet
-that arrives after one that was sent much later is dropped. Only a WELCOME is always accepted: it
-answers a HELLO, and a server whose clock was set back can then continue.
+Observations echo the newest packet, so that the server can estimate the delays. A packet is dropped
+if a packet sent much later has already arrived. Only a WELCOME is always accepted, because it
+answers a HELLO, and because a server whose clock was set back can then continue.
 """
 
 from typing import NamedTuple
@@ -13,8 +13,8 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import stamped_ns
 
 SLEPT_NS = JUMP_NS // 2
-"""Advance of the server's clock relative to the client's that proves a suspension of this machine;
-changing delays cause far less."""
+"""Advance of the server's clock over the client's that shows that this machine was suspended;
+changes of the delay cause far less."""
 
 
 class Echo(NamedTuple):
@@ -44,16 +44,16 @@ class ServerClock:
         self._overtaken_ns = overtaken_ns
 
     def begin(self) -> None:
-        """Begin again after a restart of the server, whose time stamps cannot be compared with
-        those of the earlier run.
+        """Begin again after a restart of the server: its time stamps cannot be compared with those
+        of its earlier run.
         """
         self.echo = NEVER
 
     def sent_ns(self, server_us: int, now_ns: int) -> int:
-        """Server's time of a packet's stamp [ns].
+        """Server's time at which a packet was sent [ns], from its time stamp.
 
         Raises:
-            ProtocolError: a much newer packet has overtaken it.
+            ProtocolError: a much newer packet has overtaken the packet.
         """
         server_ns = stamped_ns(server_us, self._expected_ns(now_ns))
         if self.echo.server_ns - server_ns > self._overtaken_ns:
@@ -63,10 +63,10 @@ class ServerClock:
     def hear(self, server_ns: int, now_ns: int) -> bool:
         """Note a packet sent at a time of the server; returns whether this machine was suspended.
 
-        During a suspension the client's clock may have stood still, or its jump was mistaken for a
-        clock that was set (`shared.endpoints.steady`); the server's clock has advanced in both
-        cases. After a suspension too long for time stamps, the server has forgotten the session,
-        and its WELCOME contains the full time.
+        In a suspension the client's clock may stand still; if it jumps afterwards, the jump is
+        mistaken for a clock that was set (`shared.endpoints.steady`). In both cases the server's
+        clock is ahead. After a suspension too long for time stamps, the server has forgotten the
+        session, and its WELCOME contains the full time.
         """
         slept = self.echo != NEVER and server_ns - self._expected_ns(now_ns) > SLEPT_NS
         self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)

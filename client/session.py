@@ -1,4 +1,4 @@
-"""The client's side of the conversation: a session with the server, and the server's messages.
+"""The client's side of a session with a server: opening it, and the messages in both directions.
 
     HELLO → WELCOME, or a refusal → HORIZON, HEARTBEAT … → CLOSE, silence or another WELCOME
 
@@ -45,17 +45,17 @@ REFUSED = {
     Refusal.FULL: Drop.FULL,
     Refusal.TAKEN: Drop.TAKEN,
 }
-"""Drop reason of a WELCOME that refuses the vehicle, by the refusal."""
+"""Reason for dropping a WELCOME that refuses the vehicle, by the refusal."""
 DEAF = frozenset({Idle.OBSERVATION, Idle.DELAY})
-"""Reasons of a server not to plan although another server may be able to plan."""
+"""Reasons why a server cannot plan that need not hold for another server."""
 DEGRADED = "the server misses its deadlines"
-"""Reason for the lack of newer horizons if the server reports that it is degraded."""
+"""Reason for the lack of newer plans if the server reports that it is degraded."""
 
 
 Stamped = Horizon | Trajectory | Heartbeat
 """Messages that contain the server's time."""
 FromServer = Stamped | Close | RoomMessage
-"""Messages of a server in a session."""
+"""Messages that a server sends in a session."""
 FromVehicle = Hello | Observation | Time
 
 
@@ -68,7 +68,7 @@ class ServerSession:
         role: role of the server for the vehicle.
         route: route to the server.
         timeout_ns: time without a packet after which an end considers the link lost [ns].
-        connect_s: time after which a vehicle that was never answered gives up [s].
+        connect_s: time after which the vehicle gives up if no server answers [s].
         hearing: measures losses, and chooses the longest silence to allow the server.
         events: list to which events for the operator are appended.
     """
@@ -92,7 +92,7 @@ class ServerSession:
         self._connect_ns = seconds_to_ns(connect_s)
         self.link = link
         self.hearing = hearing
-        """Measured losses, from which the longest silence to allow the server is chosen."""
+        """Loss statistics, which determine the longest silence to allow the server."""
         self.silence_asked = hearing.silence
         """Longest silence that the server allows the vehicle [half steps]; 0 for no bound."""
         self.sent = 0
@@ -101,14 +101,14 @@ class ServerSession:
         """Time of the newest packet of the session; None before the first packet and after the end.
         """
         self.useful_ns: int | None = None
-        """Time of the newest packet except heartbeats that report that the server cannot plan."""
+        """Time of the newest packet, without heartbeats that report that the server cannot plan."""
         self.sent_step = -1
         """Step of the newest observation; -1 before the first of the session."""
         self._events = events
         self.hello_ns = 0
         """Time before which no further HELLO is sent."""
         self._awaits_welcome = False
-        """Whether a HELLO was sent, and no packet of a session has arrived since."""
+        """Whether a HELLO was sent, and no packet of a session has arrived since then."""
         self._began_ns: int | None = None
         self._is_unanswered = False
         self.number: int | None = None
@@ -117,9 +117,9 @@ class ServerSession:
         self._server_boot_id: int | None = None
         self.clock = ServerClock(hearing.overtaken_ns)
         self.idle = str(Idle.PLANS)
-        """Reason for the lack of newer horizons, as the server last reported it."""
+        """Reason for the lack of newer plans, as the server last reported it."""
         self._refusal: NoSession | None = None
-        """Newest refusal of a session by the server; None after a session was opened."""
+        """Newest refusal by the server; None without one, and after a session was opened."""
         self.failure: Failure | None = None
 
     @property
@@ -154,8 +154,8 @@ class ServerSession:
         if payload is None:
             for answer in self.link.outbox():
                 self.route.put(answer, path)
-            # The answer to a CHALLENGE contains the HELLO, so the next HELLO is delayed, unless an
-            # attacker caused the CHALLENGE by replaying an old HELLO.
+            # The answer to a CHALLENGE contains the HELLO, so the next HELLO is delayed. If no
+            # WELCOME is awaited, an attacker has replayed an old HELLO.
             if self._awaits_welcome:
                 self.hello_ns = now_ns + AGAIN_NS
             return None
@@ -202,7 +202,7 @@ class ServerSession:
         try:
             return self.role.decode(payload, self._terms)
         except ProtocolError:
-            # In plaintext anybody could make the vehicle brake with five packets.
+            # Not in plaintext: there anybody could make the vehicle brake with five packets.
             if self.link.secure:
                 self.role.malformed(now_ns=now_ns)
             raise
@@ -211,12 +211,12 @@ class ServerSession:
         if (welcome.vehicle, welcome.boot_id) != (self.vehicle, self._boot_id):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         if not self._awaits_welcome:
-            # The WELCOME is a late copy or answers a late copy of a HELLO: no session is requested
-            # now.
+            # No session is requested now: the WELCOME is a late copy, or answers a late copy of a
+            # HELLO.
             raise ProtocolError(Drop.UNASKED)
         if welcome.terms != self._terms:
-            # Only before the first session: in flight the vehicle keeps its horizon, and the
-            # failsafe decides.
+            # Other terms end the client only before its first session. In flight the vehicle keeps
+            # its plan, and the failsafe decides.
             if self.number is None and self.failure is None:
                 differing = differences(self._terms, welcome.terms)
                 self._fail(SessionRefused(vehicle=self.vehicle, differences=differing))
@@ -238,7 +238,7 @@ class ServerSession:
         self._is_open = True
         self.link.adopt(now_ns=now_ns)
         self._heard(welcome.server_ns, now_ns)
-        self._awaits_welcome = True  # a repeated HELLO may have opened a newer session
+        self._awaits_welcome = True  # repeated HELLOs may open a newer session
         if restarted:
             self.role.meet(Reason.RESTARTED, now_ns=now_ns)
 
@@ -259,7 +259,7 @@ class ServerSession:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
 
     def _heard(self, server_ns: int, now_ns: int) -> None:
-        """Note a packet of the session that was sent at a time of the server [ns]."""
+        """Note a packet of the session, sent at the server's time `server_ns` [ns]."""
         if self.clock.hear(server_ns, now_ns):
             self.role.meet(Reason.STALLED, now_ns=now_ns)
         self.note_heard(now_ns)
@@ -274,7 +274,7 @@ class ServerSession:
 
     def ask(self, *, now_ns: int) -> None:
         """Send HELLO if the server is silent, or the link needs new keys."""
-        # An earlier run's motion is flown even without a session.
+        # A session may be missing in flight, too: an earlier run's motion is flown without one.
         silent = self.number is None or self.is_lost(now_ns)
         wanted = silent or self.link.wants_hello(now_ns)
         if wanted and now_ns >= self.hello_ns:
@@ -286,7 +286,7 @@ class ServerSession:
             self.route.greet(self.link.hello(hello, now_ns=now_ns))
 
     def rest(self, *, now_ns: int) -> None:
-        """Delay the next HELLO of a session that waits for its vehicle to take off."""
+        """Delay the next HELLO: the session is open, but its vehicle has not taken off yet."""
         if self.number is not None:
             self.hello_ns = now_ns + AGAIN_NS
 
@@ -310,12 +310,12 @@ class ServerSession:
         self.route.post(self.link.seal, message, now_ns)
 
     def close(self) -> None:
-        """Close the session; only another WELCOME opens a session."""
+        """Close the session; the next session needs another WELCOME."""
         self._is_open, self.heard_ns, self.useful_ns = False, None, None
 
     def wait(self, *, now_ns: int) -> bool:
-        """Whether to wait on for the flight; sets `failure` after too long without a session."""
-        if self.number is not None:  # had a session, not yet in flight
+        """Whether to go on waiting for the flight; sets `failure` after `connect_s` in vain."""
+        if self.number is not None:  # a session was opened before
             return True
         if self._began_ns is None:
             self._began_ns = now_ns
@@ -324,7 +324,7 @@ class ServerSession:
             if self._refusal is None:
                 self._fail(_ground().no_answer(self, waited_ns))
             else:
-                self.failure = self._refusal  # reported by `_note_refusal`
+                self.failure = self._refusal  # `_note_refusal` has reported it
             return False
         if not self._is_unanswered and self._refusal is None and waited_ns >= UNANSWERED_NS:
             self._is_unanswered = True

@@ -1,4 +1,4 @@
-"""A vehicle that reaches its server over several paths, or has a standby server as well."""
+"""A vehicle that reaches its server over several paths, has a standby server, or both."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -12,7 +12,7 @@ from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.scenario.registry import load
 
 PATH_SOCKETS = (0, 2, 3, 4)
-"""Numbers of a client's sockets, one for each path to its server; 1 is its autopilot's."""
+"""Numbers of a client's sockets, one for each path to its server; socket 1 is the autopilot's."""
 STANDBY_SOCKETS = (5, 6, 7, 8)
 """Numbers of a client's sockets, one for each path to its standby server."""
 
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 def by_socket(paths: Sequence[T], standby: Sequence[T]) -> dict[int, T]:
-    """Paths to the server and to its standby server, by the number of their socket."""
+    """Paths to the server and to the standby server, by the number of their socket."""
     return {
         **dict(zip(PATH_SOCKETS, paths, strict=False)),
         **dict(zip(STANDBY_SOCKETS, standby, strict=False)),
@@ -33,10 +33,9 @@ class Several(Reach):
     Args:
         paths: address of the server, or of the netem in front of it, on each path.
         link: link to the server; None: without keys.
-        names: name of each path in the log; empty: its address.
-        standby: addresses of a second server, as in `paths`, which leads when the first does not;
-            empty without one.
-        standby_link: link to that server.
+        names: name of each path in the log; empty: the addresses are the names.
+        standby: addresses of the standby server, as in `paths`; empty without a standby server.
+        standby_link: link to the standby server; None: without keys.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""Slides: changes of the measured position that the receiver's velocity does not show.
+"""Slides: gradual changes of the measured position that the receiver's velocity does not show.
 
 When the receiver's position shifts by some metres, for example after a correction, the autopilot's
 estimate slides there within 2 to 5 s, and its velocity changes accordingly. The receiver measures
@@ -6,8 +6,8 @@ its velocity g independently, and this velocity does not change:
 
     o(t) = position(t) - ∫ g dt      slides if |o(t) - o(t - SLIDE_NS)| > SLID_M + LAG_S |Δg|
 
-where Δg is the change of g in that time, which covers late fixes. After its detection a slide is
-measured for another FOLLOWED_NS, from its beginning.
+where Δg is the change of g in that time; LAG_S |Δg| allows for fixes that arrive late. After the
+detection the slide is measured for another FOLLOWED_NS, still from its beginning.
 """
 
 import math
@@ -17,11 +17,11 @@ from typing import NamedTuple
 from skytether.shared.base.units import SECOND_NS
 
 SLIDE_NS, SLID_M = 5 * SECOND_NS, 1.5
-"""Time within which a slide is detected, and the smallest slide detected [m]."""
+"""Time over which positions are compared, and the smallest displacement that is a slide [m]."""
 LAG_S = 0.3
-"""Largest delay of a fix of the receiver behind the autopilot's estimate."""
+"""Largest delay of a fix of the receiver behind the autopilot's estimate [s]."""
 FOLLOWED_NS = 5 * SECOND_NS
-"""Time for which a slide is measured after it was noticed."""
+"""Time for which a slide is still measured after its detection."""
 STEP_NS, STEP_M = SECOND_NS, 0.3
 """Minimum time, and minimum displacement [m], between two reports (`Slide`) of one slide."""
 FIX_GAP_NS = SECOND_NS
@@ -33,7 +33,7 @@ Plane = tuple[float, float]
 
 
 class Offset(NamedTuple):
-    """Offset o(t) at one fix: position minus integrated velocity."""
+    """Offset o(t) at one fix: position minus integrated velocity of the receiver."""
 
     stamp_ns: int
     velocity: Plane
@@ -42,7 +42,7 @@ class Offset(NamedTuple):
 
 class Slide(NamedTuple):
     by_m: Plane
-    """Displacement of the position since the `Slide` returned before [m]."""
+    """Displacement of the position since the previous `Slide` [m]."""
     begins: bool
 
 
@@ -68,7 +68,7 @@ class Slides:
         """Slide to be subtracted from the position from now on; None if none was detected.
 
         Args:
-            place: position in the plane, without earlier slides [m].
+            place: position in the plane, from which earlier slides are subtracted [m].
             velocity: velocity of a fix of the receiver [m/s].
             stamp_ns: time of the fix [ns].
         """

@@ -1,4 +1,4 @@
-"""Estimates without a filter, of a sensor that measures the exact state."""
+"""Estimate of the state without a filter, for a sensor that measures the exact state."""
 
 import math
 
@@ -9,7 +9,7 @@ from skytether.shared.law.model import Array
 
 
 class Newest:
-    """Replacement for a filter: it returns the newest measured positions and velocities."""
+    """Replacement for the filter: returns the newest measured positions and velocities."""
 
     def __init__(self, axes: int) -> None:
         self._zero = np.zeros(axes)

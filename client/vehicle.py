@@ -1,9 +1,9 @@
 """Interface of a vehicle to the pilot: it accepts a velocity and returns measurements.
 
 A vehicle measures at its own rate with its own time stamps, and may return measurements late or not
-at all; they are the client's only source of the vehicle's state. `client.simulated` contains
-simulated vehicles. A real one communicates with its autopilot through a `port`, an endpoint like
-any other, driven by datagrams and time. `client.vehicles` has the table of all kinds.
+at all. Measurements are the client's only source of the vehicle's state. `client.simulated`
+contains simulated vehicles. A real one communicates with its autopilot through a `port`, an
+endpoint like any other, driven by datagrams and time. `client.vehicles` has the table of all kinds.
 """
 
 import math
@@ -49,16 +49,15 @@ Coordinate = Annotated[float, msgspec.Meta(ge=-1e6, le=1e6)]
 
 
 class VehicleMemory(msgspec.Struct, frozen=True, kw_only=True):
-    """Vehicle's own state, saved for the next run of its client, see `client.memory`."""
+    """State of a vehicle that is saved for the next run of its client, see `client.memory`."""
 
     armed: bool = False
     """Whether a client has armed the vehicle since an operator last allowed arming."""
     origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    """Origin of the scenario's frame in the autopilot's local frame, in our axes [m]; None if
-    unknown."""
+    """Origin of the scenario's frame in the autopilot's local frame, z up [m]; None if unknown."""
     leap_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    """Part of `origin` due to a leap about which the operator has not decided, see `Vehicle.leap_m`
-    [m]."""
+    """Part of `origin` due to a leap about which no operator has decided yet [m], see
+    `Vehicle.leap_m`."""
     boot_ms: Annotated[int, msgspec.Meta(ge=0, lt=2**32)] = 0
     """Time since the autopilot's boot at which the fields above were last valid [ms]."""
     at_ns: Annotated[int, msgspec.Meta(ge=-(2**62), le=2**62)] = 0
@@ -80,8 +79,8 @@ class Vehicle(ABC):
     returns = False
     """Whether the vehicle can return home by itself, see `return_home`."""
     leap_m: tuple[float, ...] | None = None
-    """Displacement of the measured position on each axis about which the operator has not decided
-    [m]; it is subtracted until then. None: no leap, or the vehicle does not detect leaps."""
+    """Displacement of the measured position on each axis about which no operator has decided yet
+    [m]; until then it is subtracted. None: no leap, or the vehicle does not detect leaps."""
     failure: Failure | None = None
     """Event that makes the vehicle unusable, so that no session is requested."""
 
@@ -98,9 +97,9 @@ class Vehicle(ABC):
         """
 
     def set_parameters(self) -> bool:
-        """Allow changes of unsafe parameters of the hardware; False if it has no parameters.
+        """Allow the client to change unsafe parameters of the hardware; False if there are none.
 
-        Called before anything else, if at all.
+        If it is called, it is called before any other method.
         """
         return False
 
@@ -119,18 +118,18 @@ class Vehicle(ABC):
         return True
 
     def is_up(self, *, now_ns: int) -> bool:  # noqa: ARG002 - ignored by default
-        """Whether the vehicle is in the air and can be flown by velocities; does not arm it."""
+        """Whether the vehicle is in the air and can be flown by velocities; never arms."""
         return True
 
     @property
     def took_off(self) -> bool:
-        """Whether the vehicle has taken off during this run of the client, so that no earlier
-        motion continues.
+        """Whether the vehicle has taken off during this run of the client; then an earlier run's
+        motion is not continued.
         """
         return False
 
     def hindrance(self, *, now_ns: int) -> Reason | None:  # noqa: ARG002 - ignored by default
-        """Reason on the vehicle's side that forbids following a plan now, if there is one."""
+        """Reason on the vehicle's side that forbids following a plan now; None without one."""
         return None
 
     def decide(self, *, keeps_frame: bool) -> None:  # noqa: B027 - optional
@@ -142,7 +141,7 @@ class Vehicle(ABC):
         """
 
     def land(self) -> bool:
-        """Land without further commands; False if it cannot, so that the pilot descends."""
+        """Land without further commands; False if the client has to command the descent."""
         return False
 
     def return_home(self) -> None:  # noqa: B027 - optional
@@ -159,8 +158,8 @@ class Vehicle(ABC):
         return VehicleMemory()
 
     def recall(self, frame: VehicleMemory) -> None:  # noqa: B027 - optional
-        """Restore state saved by an earlier run of the client; called before anything else, if at
-        all.
+        """Restore the state that an earlier run of the client saved. If it is called, it is called
+        before any other method.
         """
 
     def arm(self) -> None:  # noqa: B027 - optional

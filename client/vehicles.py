@@ -1,7 +1,7 @@
 """Table of vehicles: the names that `vehicle.kind` accepts, and functions that make the vehicles.
 
-`shared.scenario.rooms` names the built-in modules, imported when a scenario names one; a plug-in
-adds a vehicle in the same way.
+`shared.scenario.rooms` names the modules of the built-in vehicles; a module is imported when a
+scenario needs it. A plug-in adds a vehicle in the same way.
 """
 
 from typing import TYPE_CHECKING
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from skytether.shared.endpoints.line import Line
 
 START_NS = 5 * SECOND_NS
-"""Longest time within which all vehicles of a fleet start."""
+"""Longest time from the start of the first vehicle of a fleet to the last [ns]."""
 vehicle = VEHICLES
 """Decorator that registers a vehicle: a function of the `Scenario` and its number that makes a
 `Vehicle`."""
@@ -37,7 +37,7 @@ def make(scenario: Scenario, number: int) -> Vehicle:
 
 
 def connection(flies: Vehicle, scenario: Scenario) -> "Line | Node | None":
-    """Connection of a vehicle's port, used as socket 1 of its process; None without a port."""
+    """Line or node of the vehicle's port, which is socket 1 of its process; None without a port."""
     if flies.port is None:
         return None
     from skytether.shared.endpoints.line import parse_line
@@ -48,6 +48,6 @@ def connection(flies: Vehicle, scenario: Scenario) -> "Line | Node | None":
 def apart_ns(vehicles: int, dt_ns: int) -> int:
     """Time from one vehicle's start to the next's [ns]: one step, less in a large fleet.
 
-    Vehicles that start at the same time would send all packets at the same time, which then queue.
+    Vehicles that start together would send all their packets together, and the packets would queue.
     """
     return min(dt_ns, START_NS // vehicles)

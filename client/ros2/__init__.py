@@ -7,7 +7,7 @@
     odometry  measurements from nav_msgs/Odometry: frames, and the robot's clock
     drive     the robot's command that gives its controlled point a velocity
 
-Messages and names are in `skytether.ros2`. The package imports `skytether.ros2`, `shared` and, from
-the client, the interface of a vehicle, its clock, positions and filter. `keys` and `kind` load
-without the extra `ros2`.
+The messages, and the names of topics and nodes, are in `skytether.ros2`. The package imports
+`skytether.ros2`, `shared` and, from the client, the interface of a vehicle, its clock, positions
+and filter. `keys` and `kind` load without the extra `ros2`.
 """

@@ -1,9 +1,9 @@
 """The controlled point of a robot, and the command that gives this point a velocity.
 
-A holonomic robot moves in every direction, and the point is the origin of its child frame. A
-differential robot only moves along its axis, and turns: its point is `ahead` metres in front of the
-axle, where every velocity is possible (feedback linearisation by a point ahead). With the rotation
-R and the turn ω of the robot:
+A holonomic robot moves in every direction, and its controlled point is the origin p of its child
+frame. A differential robot can only drive forwards or backwards, and turn: its point is `ahead`
+metres in front of the axle, where every velocity is possible (feedback linearisation). With the
+rotation R, velocity v and turn rate ω of the robot:
 
     position = p + R (ahead, 0, 0)      velocity = R (v + (0, ahead ω, 0))
     command: linear x = (Rᵀ u)₁, and turn = (Rᵀ u)₂ / ahead
@@ -22,11 +22,11 @@ class Command(NamedTuple):
     linear: Vector
     """Linear velocity in the frame of the command [m/s]."""
     turn: float
-    """Turn about the vertical axis [rad/s]."""
+    """Turn rate about the vertical axis [rad/s]."""
 
 
 def point(odometry: Odometry, ahead: float) -> tuple[Vector, Vector]:
-    """Position and velocity of the point in the fixed frame [m, m/s]; `ahead` [m] may be 0."""
+    """Position [m] and velocity [m/s] of the controlled point, in the fixed frame; `ahead`: [m]."""
     x, y, z = odometry.velocity
     if odometry.child != odometry.frame:
         velocity = from_robot(odometry.rotation, (x, y + ahead * odometry.turn[2], z))
@@ -39,7 +39,7 @@ def point(odometry: Odometry, ahead: float) -> tuple[Vector, Vector]:
 
 
 def command(velocity: Vector, odometry: Odometry, drive: str, ahead: float) -> Command:
-    """Command for a velocity of the point in the fixed frame [m/s]; `drive` as in `ros2.drive`."""
+    """Command that gives the controlled point a velocity, in the fixed frame [m/s]."""
     if drive == "fixed":
         return Command(odometry.frame, velocity, 0.0)
     forward, left, up = to_robot(odometry.rotation, velocity)

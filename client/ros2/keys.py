@@ -18,15 +18,15 @@ class Ros2Config(Section, frozen=True):
     command: OfVehicle[TopicName] = "/cmd_vel"
     """Topic on which velocities are commanded."""
     stamped: OfVehicle[bool | Literal["auto"]] = "auto"
-    """Whether commands are geometry_msgs/TwistStamped; otherwise Twist. auto: the type that the
+    """Type of commands: true: geometry_msgs/TwistStamped; false: Twist; auto: the type that the
     subscriber of `command` expects."""
     drive: OfVehicle[Literal["holonomic", "differential", "fixed"]] = "holonomic"
-    """Kind of commands: holonomic: any velocity in the robot's frame; differential: forwards and a
-    turn; fixed: any velocity in the fixed frame of its odometry."""
+    """Kind of commands: holonomic: any velocity in the robot's frame; differential: forward speed
+    and turn rate; fixed: any velocity in the fixed frame of the robot's odometry."""
     ahead_m: OfVehicle[Annotated[float, Meta(ge=0.01, le=10)]] = 0.2
-    """Distance from the axle forwards to the point that follows a plan (`differential`) [m]."""
+    """Distance from the axle to the point ahead that follows a plan [m]; `differential` only."""
     origin: OfVehicle[Literal["start", "odometry"]] = "start"
-    """Origin of the scenario: start: the robot's position at the start (on a mission, that position
+    """Origin of the scenario: start: the robot's position at the start (on a mission, this position
     is its first goal); odometry: the origin of its odometry."""
     silence_s: OfVehicle[Annotated[float, Meta(ge=0.05, le=5)]] = 0.5
     """Time without odometry after which the robot brakes [s]."""

@@ -8,7 +8,7 @@ from skytether.shared.scenario.schema import Scenario
 
 @VEHICLES
 def ros2(scenario: Scenario, number: int) -> Vehicle:
-    """Robot that speaks ROS 2 by rmw_zenoh at `vehicle.address`, flown by velocities."""
+    """Robot that speaks ROS 2 over rmw_zenoh at `vehicle.address`, driven by velocities."""
     extras.need("ros2")
     from skytether.client.ros2.vehicle import Ros2Vehicle
 

@@ -5,8 +5,8 @@ A robot answers no questions about its clock, so only the arrivals of messages s
     the fastest message of an interval, stamped b, arrives at t, after at most ROUND_TRIP_NS:
     offset = t - ROUND_TRIP_NS / 2 - b
 
-which is a sample like the answer of an autopilot. A delay common to all messages cannot be
-detected; measurements then count as younger by this delay.
+This sample is used like the answer of an autopilot (`client.clock`). A delay that all messages have
+cannot be detected; measurements then count as younger by this delay.
 """
 
 from skytether.client.clock import BootClock
@@ -20,9 +20,9 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.scenario.schema import Scenario
 
 ROUND_TRIP_NS = 4 * MILLISECOND_NS
-"""Assumed bound of the delay of an interval's fastest message: the client runs aboard."""
+"""Assumed bound of the delay of an interval's fastest message: small, as the client runs aboard."""
 BEGIN_NS, INTERVAL_NS = 100 * MILLISECOND_NS, SECOND_NS
-"""Interval of clock samples before the clock is known, and after."""
+"""Interval between two clock samples before the clock is known, and afterwards."""
 
 
 class OdometryFilter:
@@ -47,11 +47,11 @@ class OdometryFilter:
         """Arrival and stamp of the fastest message of the present interval [ns]."""
         self._sampled_ns: int | None = None
         self._fault = ""
-        """Fault of the newest message, apart from its time, in words; empty if it has none."""
+        """Fault in the content of the newest message, in words; empty without a fault."""
 
     @property
     def fault(self) -> str:
-        """Why the newest message was not used, in words; empty if it was."""
+        """Why the newest message was not used, in words; empty if it was used."""
         return self._fault or self.positions.fault
 
     def hear(self, payload: bytes, *, now_ns: int) -> None:

@@ -1,10 +1,10 @@
-"""The connection to a robot as an endpoint: its topics are the peers of the datagrams.
+"""The connection to a robot as an endpoint; topics take the place of the datagrams' addresses.
 
     in   odometry; commands of other nodes; tokens of the graph, with an empty payload once removed
     out  commands, at each of the pilot's steps; after a landing zeros for ZEROS_NS, then silence
 
-Commands have the type that a subscriber accepts: TwistStamped or Twist. Without a subscriber of
-either, no flight begins, because the robot would not move.
+Commands have the type that a subscriber accepts: TwistStamped or Twist. Without a subscriber of one
+of these types no flight begins, because the robot would not move.
 
 No command is repeated: if the pilot stops, the robot's own time-out acts.
 """
@@ -29,12 +29,12 @@ from skytether.shared.telemetry.record import Reason
 TICK_NS = 100 * MILLISECOND_NS
 """Interval at which timers are checked while nothing arrives."""
 ZEROS_NS = 500 * MILLISECOND_NS
-"""Time for which zeros are commanded at the end of a flight, before the silence."""
+"""Time for which zero velocities are commanded at the end of a flight, before the silence."""
 CLOSES = 3
 """Number of zero velocities sent when the process ends."""
 ZERO = 0.0, 0.0, 0.0
 RIVAL_NS, RIVALS_LEAST = SECOND_NS, 2
-"""Window, and number of other nodes' commands in it that count as a second commander."""
+"""Window, and number of other nodes' commands within it that reveal a second commander."""
 QUIET_NS = 3 * SECOND_NS
 """Silence after which a second commander counts as gone."""
 REPORT_NS = 10 * SECOND_NS
@@ -65,9 +65,9 @@ class Port(Endpoint):
         )
         self.odometry = OdometryFilter(scenario, vehicle)
         self._entities: dict[str, Entity] = {}
-        """Other nodes' publishers and subscribers of our topics, by token."""
+        """Other nodes' publishers and subscribers of the client's topics, by token."""
         self._form: int | None = None
-        """Index of the commands' type in the node's `forms`, once a command was sent."""
+        """Index of the commands' type in `Node.forms`; None before the first command."""
         self._rivals_ns: deque[int] = deque(maxlen=RIVALS_LEAST)
         self._rival_ns: int | None = None
         """Time of the newest command of a second commander; None without one."""
@@ -75,7 +75,7 @@ class Port(Endpoint):
         self._reported_fault = False
         self._tick_ns = self._zero_ns = 0
         self._silent_ns: int | None = None
-        """End of the zeros after a landing; None before it."""
+        """Time at which the zeros after a landing end; None before the landing."""
         self._commands = self._rival_commands = 0
         self.now_ns = 0
 
@@ -139,7 +139,7 @@ class Port(Endpoint):
             self._silent_ns, self._zero_ns = self.now_ns + ZEROS_NS, self.now_ns
 
     def hindrance(self, *, now_ns: int) -> Reason | None:
-        """Reason, in this order: second commander, silence, unusable odometry."""
+        """Reason that forbids following a plan: second commander, silence or unusable odometry."""
         self.now_ns = now_ns
         if self._rival_ns is not None and now_ns - self._rival_ns <= QUIET_NS:
             return Reason.RIVAL
@@ -178,7 +178,7 @@ class Port(Endpoint):
         if len(self._rivals_ns) < RIVALS_LEAST or now_ns - self._rivals_ns[0] > RIVAL_NS:
             return
         self._rival_ns = now_ns
-        if self._silent_ns is not None:  # after a landing other nodes may command the robot
+        if self._silent_ns is not None:  # after the flight other nodes may command the robot
             return
         if self._reported_ns is None or now_ns - self._reported_ns >= REPORT_NS:
             self._reported_ns = now_ns
@@ -220,14 +220,14 @@ class Port(Endpoint):
         self.send(payload, (keys.command, form))
 
     def close(self, *, now_ns: int) -> None:
-        """Send zeros, because not every robot stops when commands end."""
+        """Send zero velocities, because not every robot stops when commands end."""
         self.now_ns = now_ns
         if self._commands and not self.is_down:
             for _ in range(CLOSES):
                 self._command(ZERO)
 
     def figures(self) -> dict[str, Any]:
-        """Figures under the same names as an autopilot's, so that the same metrics show them."""
+        """Figures with the names that an autopilot's have, so that the same metrics show them."""
         return {
             "measurements": self.odometry.positions.taken,
             "heard": self.odometry.heard,
@@ -239,7 +239,7 @@ class Port(Endpoint):
 
 
 def _instead(others: Sequence[Entity], expected: Iterable[Topic]) -> str:
-    """Mismatch between the types found and those expected, in words; empty if none was found."""
+    """Mismatch between found and expected types, in words; empty if no type was found."""
     if not others:
         return ""
     hashes = " or ".join(topic.type_hash for topic in expected)

@@ -33,7 +33,7 @@ class Ros2Vehicle(Vehicle):
         self.node = self._port.node
         self._positions = self._port.odometry.positions
         self._placed = 0
-        """Number of measurements when the origin was placed; flight begins with a later one."""
+        """Number of measurements used before the origin was set; the flight needs a later one."""
 
     def fly(self, velocity: Array) -> None:
         x, y, *up = velocity.tolist()
@@ -51,7 +51,7 @@ class Ros2Vehicle(Vehicle):
         return self._port.waits_for
 
     def take_off(self, *, now_ns: int) -> bool:
-        """Set the origin to the robot's place, unless it is known; a robot needs no take-off."""
+        """Set the origin to the robot's position, unless it is known. A robot needs no take-off."""
         self._port.now_ns = now_ns
         if self._port.is_ready and not self._positions.has_origin:
             self._positions.begin()
@@ -81,7 +81,7 @@ class Ros2Vehicle(Vehicle):
         self._positions.decide(keeps_frame=keeps_frame)
 
     def land(self) -> bool:
-        """Stop: zeros for a while, then silence."""
+        """Stop: send zero velocities for a while, then nothing."""
         self._port.land()
         return True
 

@@ -23,7 +23,7 @@ def moved(x: Table, model: Table, inputs: Numbers) -> None:
 
     Args:
         x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-        model: rows of `Axis`.
+        model: discrete model of each axis, rows of `Axis`.
         inputs: input that acts on each axis [m/s].
     """
     for i in range(len(x)):
@@ -42,7 +42,7 @@ class FirstOrderPlant:
         model = discretise(tau, scenario.control.dt)
         self._model, self._gain = np.stack(model, -1), scenario.true_gain
         self._inputs: Any = None
-        """`PendingInputs` that do not act yet; None without a dead time."""
+        """Inputs that do not act yet (`PendingInputs`); None without a dead time."""
         if any(late_s):
             dead_time = rooms.dead_time()
             late = [

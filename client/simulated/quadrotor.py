@@ -12,7 +12,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario, VehicleConfig
 
 GAINS = {"crazyflie": CRAZYFLIE, "1.5kg": ARDUPILOT, "sih": PX4}
-"""Gains of the autopilot, by frame (`vehicle.frame`)."""
+"""Gains of the autopilot, by airframe (`vehicle.frame`)."""
 ALTITUDE_M = 5.0
 """Altitude of a flight in the plane [m]."""
 

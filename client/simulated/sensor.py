@@ -2,9 +2,9 @@
 
     z(k) = x(k - D) + b + σ n          D: delay [steps]   b: bias   σ n: noise
 
-A measurement is made at the start of a step, and becomes available at the start of the first step
-at which it is due and its delay has passed. At step 0 every measured quantity is due; before step 0
-the vehicle stands at its start.
+A measurement is made at the start of a step, and becomes available D steps later, but only at steps
+at which the sensor's rate makes it due. At step 0 every measured quantity is due; before step 0 the
+vehicle stands at its start.
 """
 
 from collections import deque
@@ -25,10 +25,10 @@ def sensed(state: Table, bias: Table, noise: Numbers, drawn: Table, measured: Ta
 
     Args:
         state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-        bias: b of positions and velocities; shape (2, axes).
-        noise: σ of a position and of a velocity.
-        drawn: n of positions and velocities; shape (2, axes).
-        measured: output: measured positions and velocities; shape (2, axes).
+        bias: b of positions [m] and velocities [m/s]; shape (2, axes).
+        noise: σ of a position [m] and of a velocity [m/s].
+        drawn: random numbers n of positions and velocities; shape (2, axes).
+        measured: output: positions [m] and velocities [m/s]; shape (2, axes).
     """
     for which in range(2):
         for axis in range(len(state)):
@@ -52,11 +52,11 @@ class Sensor:
         self._rng = rng
         noisy = self._noise.nonzero()[0].tolist()
         self._normals = Normals(rng, (len(noisy), len(nothing))) if noisy else None
-        """Random numbers n of a sensor that measures the whole state at every step."""
+        """Random numbers n, for a sensor that measures the whole state at every step."""
         self._noisy = noisy
-        """Indices of the measured quantities with noise: position 0, velocity 1."""
+        """Indices of the quantities with noise: 0: position, 1: velocity."""
         self._drawn = np.zeros_like(self._bias)
-        """Numbers n if only one of position and velocity has noise; shape (2, axes)."""
+        """Numbers n of both quantities; 0 for a quantity without noise. Shape (2, axes)."""
         self._states: deque[Array] = deque(maxlen=self.delay + 1)
         self._step = 0
 
@@ -73,7 +73,7 @@ class Sensor:
             return Measurement(stamp_ns, *state.T.tolist())
         states = self._states
         states.append(state)
-        # Before the first measurement is due, the vehicle has stood at its start.
+        # Before step 0 the vehicle stood at its start.
         while len(states) <= self.delay:
             states.append(states[0])
         if self._is_prompt:

@@ -1,4 +1,4 @@
-"""Simulated vehicle: a plant in its weather, advanced step by step, and its sensor."""
+"""Simulated vehicle: a plant in its weather, which is advanced step by step, and a sensor."""
 
 from collections.abc import Sequence
 from typing import Protocol
@@ -27,7 +27,7 @@ class Plant(Protocol):
         """Fly one step with this desired velocity [m/s]; shape (axes,)."""
 
     def change(self, vehicle: VehicleConfig) -> None:
-        """Use changed winds from the next step on."""
+        """Use the wind of changed keys from the next step on."""
 
 
 class SimulatedVehicle(Vehicle):
@@ -49,12 +49,12 @@ class SimulatedVehicle(Vehicle):
         self._velocity = velocity
 
     def measurements(self, *, now_ns: int) -> Sequence[Measurement]:
-        """Measurements that became available; first advances the plant to the present step."""
+        """Measurements that became available. The plant is first advanced to the present step."""
         available: list[Measurement] = []
         if self._step < 0:
             self._began_ns = now_ns
-        # The plant's state is that of the start of a step. The plant has no clock and is advanced
-        # on demand.
+        # The plant's state is the state at the start of a step. The plant has no clock: it is
+        # advanced here, on demand.
         while self._began_ns + (self._step + 1) * self._dt_ns <= now_ns:
             if self._step >= 0:
                 self.plant.advance(self._velocity)

@@ -22,7 +22,7 @@ def shoved(x: Table, white: Table, drawn: Table) -> None:
 
     Args:
         x: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-        white: square root of the effect's covariance, [L11, L21, L22] of each axis.
+        white: Cholesky factor of the effect's covariance, [L11, L21, L22] of each axis.
         drawn: two normal random numbers per axis.
     """
     for i in range(len(x)):
@@ -48,8 +48,8 @@ class Weather:
         L = vehicle.wind * white_acceleration(self._tau, self._dt_s)
         self._white = np.stack((L[:, 0, 0], L[:, 1, 0], L[:, 1, 1]), -1) if vehicle.wind else None
         self._gust_mps2 = vehicle.gust_mps2
-        # Probability that an event of constant rate occurs in a step, exact for any length of a
-        # step.
+        # Probability that a gust ends (or begins) within a step, at a constant rate: exact for any
+        # length of the step.
         self._gust_end_chance = float(-np.expm1(-self._dt_s / vehicle.gust_s))
         self._gust_start_chance = float(-np.expm1(-self._dt_s / vehicle.gust_every_s))
         self._steady_mps = np.array(vehicle.steady_wind_mps or np.zeros(len(self._tau)))
@@ -58,7 +58,7 @@ class Weather:
         self._push = self._pushed()
 
     def push(self) -> Array:
-        """Push w + τ a over the next step, which acts like an input [m/s]; shape (axes,)."""
+        """Wind and gust over the next step as an input, w + τ a [m/s]; shape (axes,)."""
         if self._gust_mps2 != 0.0:
             self._gusts()
         return self._push
@@ -70,7 +70,7 @@ class Weather:
         """
         if self._white is None:
             return
-        # Not drawn in advance if gusts use numbers of the same stream between two steps.
+        # With gusts, not drawn in advance: gusts draw from the same stream between two steps.
         gusty = self._gust_mps2 != 0.0
         drawn = self._rng.standard_normal(x.shape) if gusty else self._normals.next()
         shoved(x, self._white, drawn)

@@ -1,1 +1,1 @@
-"""A vehicle with a standby server, which leads when the first is silent."""
+"""A vehicle with a standby server, which leads when the first server is silent."""

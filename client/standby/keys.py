@@ -12,7 +12,7 @@ class LinkConfig(schema.LinkConfig, frozen=True):
     leader: Annotated[
         Literal["server", "standby"], Key(Owner.VEHICLE, "leader", is_decision=True)
     ] = "server"
-    """Server that leads, chosen by an operator in flight; it leads until it is silent, see
+    """Server that an operator chooses in flight to lead; it leads until it falls silent, see
     docs/operating.md."""
 
 

@@ -1,10 +1,10 @@
 """Leadership: the choice of the server that plans for a vehicle.
 
-The vehicle decides, by a number that only rises: with s servers, number n means that server n mod s
-leads, and plans made under another number are not flown. The vehicle raises the number when the
-leader is silent and another server answers; on an operator's order; and on a mission when a server
-reports a larger number from another vehicle, so that all vehicles follow one server. On a mission
-it follows no server whose motions have other limits than those of the leader.
+The vehicle decides by its leadership number, which only rises: with s servers, number n means that
+server n mod s leads, and plans made under another number are not flown. The vehicle raises the
+number when the leader is silent and another server answers; on an operator's order; and on a
+mission when a server reports another vehicle's larger number, so that all follow one server. On a
+mission it follows no server whose motions have other limits than the leader's.
 """
 
 from collections.abc import Sequence
@@ -12,19 +12,19 @@ from collections.abc import Sequence
 from skytether.shared.law.limits import Limits
 
 NUMBER_MAX, JUMP_MAX = 2**32 - 1, 10_000
-"""Largest number of a leadership, and largest accepted rise to a number from a server."""
+"""Largest leadership number, and largest accepted rise to a number that a server reports."""
 ASK_SHARE, CHANGE_SHARE = 0.35, 0.75
 """Shares of the time-out for which the leader has to be silent before the vehicle sends LEAD to
-another server, and before that server leads. The first is just above the interval of heartbeats
-over a good link, because the plan in force soon ends."""
+another server, and before that server leads. The first share is small, just above the interval of
+heartbeats over a good link, because the plan in force soon ends."""
 
 
 class Leadership:
-    """Number of the leadership.
+    """Leadership number of a vehicle, and the rules by which it rises.
 
     Args:
         servers: number of servers, 1 or more.
-        number: number of an earlier run of the client.
+        number: leadership number of an earlier run of the client; 0 without one.
         timeout_ns: silence after which the vehicle considers a server lost [ns].
     """
 
@@ -33,10 +33,10 @@ class Leadership:
         self._ask_ns = round(ASK_SHARE * timeout_ns)
         self._change_ns = round(CHANGE_SHARE * timeout_ns)
         self.limits: list[Limits | None] = [None] * servers
-        """Limits of each server's motions, as last received; None before that, or without a
+        """Limits of each server's motions, as last received; None if not received, or without a
         mission."""
         self._changes = [0] * servers
-        """Number of changes of `limits` in each server's run, as last received."""
+        """Number of changes of `limits` since each server's start, as last received."""
 
     @property
     def leader(self) -> int:
@@ -48,12 +48,12 @@ class Leadership:
         self._changes[server] = 0
 
     def hear_limits(self, server: int, limits: Limits | None, changes: int) -> None:
-        """Note the limits that a server sent, unless later ones have arrived."""
+        """Note the limits that a server sent, unless later limits have already arrived."""
         if changes >= self._changes[server]:
             self._changes[server], self.limits[server] = changes, limits
 
     def may_lead(self, server: int) -> bool:
-        """Whether a server's limits equal the leader's, or one of the two is unknown."""
+        """Whether a server's limits equal the leader's, as far as both are known."""
         theirs, ours = self.limits[server], self.limits[self.leader]
         return theirs is None or ours is None or theirs == ours
 
@@ -66,25 +66,25 @@ class Leadership:
         return now_ns - heard_ns[self.leader] >= self._ask_ns
 
     def successor(self, heard_ns: Sequence[int], now_ns: int) -> int | None:
-        """Server that replaces a silent leader; None if the leader is not silent, or no other
-        server answers that may lead.
+        """Server that replaces a silent leader; None if the leader is not silent, or if no server
+        that may lead answers.
         """
         last_ns = heard_ns[self.leader]
         if now_ns - last_ns < self._change_ns:
             return None
         newest = max(filter(self.may_lead, range(self._servers)), key=heard_ns.__getitem__)
-        # Only a server heard since the leader was doubted: otherwise both may be out of reach.
+        # The server must have been heard after the leader fell silent: both may be out of reach.
         return newest if heard_ns[newest] >= last_ns + self._ask_ns else None
 
     def hand_over(self, server: int) -> None:
-        """Let a server lead from now on; no effect if it leads or all numbers are used up."""
+        """Let a server lead from now on; no effect if it leads already or no number is left."""
         raised = self.number + (server - self.number) % self._servers
         if raised <= NUMBER_MAX:
             self.number = raised
 
     def exceed(self, number: int, server: int) -> None:
-        """Let `server` lead, if it may, with a number above `number`, which an earlier run of this
-        vehicle sent but did not save.
+        """Raise the number above `number`, which an earlier run of the client sent but did not
+        save, and let `server` lead if it may.
         """
         if self.number < number <= NUMBER_MAX - self._servers:
             leads = server if self.may_lead(server) else self.leader
@@ -92,7 +92,7 @@ class Leadership:
             self.hand_over(leads)
 
     def learn(self, number: int, server: int) -> bool:
-        """Adopt a larger number from the server that leads under it, if that server may lead."""
+        """Adopt a larger number from the server that it makes the leader, if that one may lead."""
         is_larger = self.number < number <= min(NUMBER_MAX, self.number + JUMP_MAX)
         if not is_larger or number % self._servers != server or not self.may_lead(server):
             return False

@@ -1,10 +1,10 @@
-"""The servers of a vehicle: choice of the one that leads, and LEAD messages that report it.
+"""The servers of a vehicle: choice of the leader, and LEAD messages that announce the leader.
 
 The vehicle changes the leader by the rules of `leadership`; the failsafe receives packets and
 faults of the leader only.
 
-The class `Servers` replaces `client.alone.OneServer`; `client.several` loads it if there is a
-standby server, and `client.alone.Reach` if an earlier run of the client had one.
+The class `Servers` replaces `client.alone.OneServer`. `client.several` loads it if there is a
+standby server, and `client.memory` if an earlier run of the client had one.
 """
 
 from dataclasses import dataclass
@@ -34,28 +34,28 @@ NAMES = ("server", "standby")
 SOON_NS = 200 * MILLISECOND_NS
 """Time after which LEAD is sent again to a leader that has not answered [ns]."""
 GROUND_NS = 3 * SECOND_NS
-"""Additional time for which the leader of a vehicle on the ground may be silent [ns]: it then only
-answers HELLOs, and the first ones need several packets each way."""
+"""Additional time for which the leader of a vehicle on the ground may be silent [ns]: the leader
+then only answers HELLOs, and the first handshake needs several packets each way."""
 DEPARTURES = frozenset({Reason.CLOSED, Reason.RESTARTED})
 """Causes after which a server stops leading if another server answers."""
 NEVER_NS = -(2**63)
 NOT_THE_LEADER = "not the leader"
 """Reason for dropping a plan of a server that does not lead, or of an earlier leadership."""
 LOST_TIMES = 6
-"""Silence after which a server that does not lead counts as lost, as a multiple of the time-out; at
-most half of SESSION_NS."""
+"""Silence after which a server that does not lead counts as lost, as a multiple of the time-out;
+`lost_after_ns` limits it to half of SESSION_NS."""
 
 
 @dataclass(slots=True)
 class LeadState:
-    """LEAD messages to one server, and its answers, in the present session."""
+    """LEAD messages to one server, and the server's answers, in the present session."""
 
     number: int | None = None
-    """Largest number of a leadership in the server's answers; None before the first answer."""
+    """Largest leadership number in the server's answers; None before the first answer."""
     again_ns: int = 0
     """Time before which no further LEAD is sent to the server [ns]."""
     asked: tuple[int, int] = 0, -SESSION_NS
-    """Vehicle's step, and time [ns], of the newest LEAD sent to the server."""
+    """Step of the vehicle, and time [ns], at which the newest LEAD was sent to the server."""
 
 
 class Servers(OneServer):
@@ -72,7 +72,7 @@ class Servers(OneServer):
         super().__init__(parts.failsafe)
         number = getattr(parts.before, "leadership", 0)  # `Fresh` has no leadership
         timeout_ns = seconds_to_ns(parts.scenario.link.timeout_s)
-        # A vehicle without its former standby server informs the other server that it leads now.
+        # Without its former standby server, the vehicle tells the other server that it leads now.
         number += bool(number and count == 1)
         self.leadership = Leadership(count, number, timeout_ns)
         self.sessions: list[ServerSession] = []
@@ -81,24 +81,24 @@ class Servers(OneServer):
         self._dt_ns, self._timeout_ns = parts.terms.dt_ns, timeout_ns
         self._motion = parts.motion
         self._reported = number
-        """Number of the leadership that was last reported."""
+        """Leadership number that was last reported."""
         self._differing: dict[int, tuple[Difference, ...]] = {}
-        """Latest reported differences of limits, by number of a server that may not lead."""
+        """Differences of limits last reported, by number of a server that may not lead."""
         self._now_ns = NEVER_NS
         self._counted_from_ns: int | None = None
-        """Time before which the silence of the leader does not count [ns]: a server that does not
-        lead, or leads a vehicle on the ground, sends rarely. None before the first wake."""
+        """Time before which the silence of the leader does not count [ns], because a server that
+        did not lead, or led a vehicle on the ground, sent rarely. None before the first wake."""
         self._was_on_ground = False
         self._silent_since_ns = NEVER_NS
-        """Start of the leader's silence for which the failsafe's time-out was last restarted [ns];
-        one restart per silence."""
+        """Start of the leader's silence [ns] for which the failsafe's time-out was last restarted:
+        it is restarted once in each silence."""
 
     @property
     def followed(self) -> ServerSession:
         return self.sessions[self.leadership.leader]
 
     def begin(self, server: int) -> None:
-        """Note another session with a server."""
+        """Note that a new session with a server begins."""
         self._lead_states[server] = LeadState()
         self.leadership.begin(server)
 
@@ -119,7 +119,7 @@ class Servers(OneServer):
     # -- deciding ----------------------------------------------------------------------------
 
     def follow(self, *, step: int, on_ground: bool, now_ns: int) -> None:
-        """Let another server lead if the leader is silent, and inform all servers of the leader.
+        """Let another server lead if the leader is silent, and tell all servers which server leads.
 
         Args:
             step: step of the vehicle.
@@ -139,8 +139,8 @@ class Servers(OneServer):
             lead.hand_over(successor)
         self._report()
         self._report_limits()
-        # Sent only once the number is saved: the next run of the client must not follow an earlier
-        # leadership than the servers.
+        # LEAD is sent only after the number is saved: the next run of the client must not begin
+        # with a smaller number than the servers know.
         if self.may_tell(now_ns):
             self._tell(lead.doubts(heard_ns, now_ns), heard_ns[lead.leader], step, now_ns)
 
@@ -151,7 +151,7 @@ class Servers(OneServer):
         self._report()
 
     def leave(self, server: int, cause: Reason, *, now_ns: int) -> bool:
-        """Let another server lead after a fault of a server, or after its end.
+        """Let another server lead after a fault or the end of a server, if that server led.
 
         Returns:
             whether another server leads now; otherwise the failsafe has to act on the cause.
@@ -186,7 +186,7 @@ class Servers(OneServer):
     # -- LEAD messages -----------------------------------------------------------------------
 
     def _tell(self, doubts: bool, leader_ns: int, step: int, now_ns: int) -> None:
-        """Send LEAD to each server that has not answered with the present leadership.
+        """Send LEAD to each server that has not answered with the present leadership number.
 
         Args:
             doubts: whether the leader is silent; LEAD is then sent to the other servers too, whose
@@ -195,7 +195,7 @@ class Servers(OneServer):
         """
         if doubts and leader_ns != self._silent_since_ns and not self._is_alone(now_ns):
             self._silent_since_ns = leader_ns
-            self.failsafe.heard(now_ns=now_ns)  # wait another time-out for the other server
+            self.failsafe.heard(now_ns=now_ns)  # the other server gets another time-out
         for state, session in zip(self._lead_states, self.sessions, strict=True):
             if session.number is None or now_ns < state.again_ns:
                 continue
@@ -206,10 +206,10 @@ class Servers(OneServer):
                 session.post(self._lead(session, step), now_ns)
 
     def take(self, server: int, message: Message, now_ns: int) -> bool:
-        """Process a LEAD of a server; False for any other message.
+        """Process a LEAD from a server; False for any other message.
 
-        A late answer does no harm: numbers of leaderships only rise. It counts as an answer of a
-        live server only if the LEAD that it answers was sent recently.
+        A late answer does no harm, because leadership numbers only rise. An answer shows that the
+        server is alive only if the LEAD that it answers was sent recently.
         """
         if not isinstance(message, Lead):
             return False
@@ -225,7 +225,7 @@ class Servers(OneServer):
         return True
 
     def _is_alone(self, now_ns: int) -> bool:
-        """Whether no other server that may lead answers."""
+        """Whether none of the other servers that may lead answers."""
         may_lead = filter(self.leadership.may_lead, range(self._count))
         return all(
             self.sessions[i].role.is_followed or self.sessions[i].is_lost(now_ns) for i in may_lead
@@ -249,7 +249,7 @@ class Servers(OneServer):
         return LimitsDiffer(vehicle=self._vehicle, host=host, port=port, differences=differing)
 
     def _report_limits(self) -> None:
-        """Report servers that may not lead, once for each difference."""
+        """Report servers that may not lead, once for each difference of limits."""
         for server in range(self._count):
             if self.leadership.may_lead(server):
                 self._differing.pop(server, None)
@@ -260,7 +260,7 @@ class Servers(OneServer):
                 self._events.append(event)
 
     def _report(self) -> None:
-        """Report that another server leads; its packets reach the failsafe from now on."""
+        """Report a new leader, if any; its packets reach the failsafe from now on."""
         if self._reported == self.leadership.number:
             return
         self._reported, session = self.leadership.number, self.followed
@@ -282,7 +282,7 @@ class OneOfServers(Role):
     def __init__(self, servers: Servers, server: int) -> None:
         self._servers, self._server = servers, server
         self._plan_number = 0
-        """Number of the leadership of the plan that was decoded last."""
+        """Leadership number of the plan that was decoded last."""
         super().__init__(servers.failsafe)
         self.heard, self.malformed, self.meet = self._heard, self._malformed, self._meet
 
@@ -310,7 +310,7 @@ class OneOfServers(Role):
         return self._servers.take(self._server, message, now_ns)
 
     def lost_after_ns(self, timeout_ns: int) -> int:
-        """See `Role`; shorter than the time after which the server forgets the session."""
+        """See `Role`; the result is shorter than the time in which a server forgets a session."""
         if self.is_followed:
             return timeout_ns
         return max(timeout_ns, min(LOST_TIMES * timeout_ns, SESSION_NS // 2))
