@@ -61,10 +61,10 @@ class ClientOptions(ProcessOptions):
         Argument(
             metavar="LOCAL=HOST:PORT",
             append=True,
-            help="Path to the server, in place of --server; may be repeated, for one to four paths "
-            "at once. LOCAL is an interface, as in wwan0=ground:47000, or an address of this "
-            "machine, as in 192.0.2.7=ground:47000 or [2001:db8::7]=ground:47000, or empty for "
-            "any. Any of several paths may fail for a time.",
+            help="Path to the server, in place of --server; may be repeated for up to four paths, "
+            "each of which may fail for a time. LOCAL is an interface, as in wwan0=ground:47000, "
+            "or an address of this machine, as in 192.0.2.7=ground:47000 or "
+            "[2001:db8::7]=ground:47000, or empty for any address.",
         ),
     ] = ()
     standby: Annotated[
@@ -72,9 +72,9 @@ class ClientOptions(ProcessOptions):
         Argument(
             metavar="HOST:PORT",
             append=True,
-            help="A second server, or netem in front of it; it leads the vehicle when the first is "
-            "silent. LOCAL=HOST:PORT as in --path; repeated, it gives each path to that "
-            "server. It may be unreachable for a time, also at the start. none: no such server.",
+            help="Standby server, or netem in front of it: this server leads when the first is "
+            "silent, and may be unreachable for a time, also at the start. Repeat --standby with "
+            "LOCAL=HOST:PORT, as in --path, for each path to it. none: no standby server.",
         ),
     ] = ()
     number: Annotated[int, Argument(name="id")] = 1
