@@ -82,8 +82,8 @@ class ClientOptions(ProcessOptions):
     vehicles: Annotated[int, Argument(metavar="N")] = 1
     """Number of vehicles to fly in this process; the first has the number --id."""
     keys: Path | None = None
-    """File with the vehicle's key, made by `skytether keygen`. Without it the link is plaintext,
-    which is refused unless the server is on this machine."""
+    """File with the vehicle's key, made by `skytether keygen`. Without this file the link is
+    plaintext; that is refused unless the server is on this machine."""
     key_id: Annotated[int | None, Argument(metavar="N")] = None
     """Number of the key to use if the file has two keys of the vehicle; by default the highest."""
     set_parameters: bool = False

@@ -207,7 +207,7 @@ class Compensator:
         return flown, without_feedback
 
     def flown_since(self, step: int) -> int:
-        """First step whose input comes from the plan in force, given the next step, `step`."""
+        """First step with an input from the plan in force; `step`: the next step to be flown."""
         return step if self._new else self.since
 
     def foresee(self, states: Array, flown: Array | None = None) -> Array:

@@ -176,7 +176,7 @@ class Client(Endpoint):
             self._port.receive(datagram, now_ns=now_ns)
             self._attend(self._port, now_ns)
             return
-        # Before decryption: a packet from another address costs one comparison.
+        # Checked before decryption: a packet from another address costs only one comparison.
         end = self._ends.get((datagram.socket, datagram.peer))
         if end is None:
             self.dropped[Drop.ELSEWHERE] += 1
@@ -296,7 +296,7 @@ class Client(Endpoint):
         self._report(now_ns)
 
     def _report(self, now_ns: int) -> None:
-        """Send the messages that are due after a step to the servers."""
+        """Send the servers the messages that are due after a step."""
         pilot = self._pilot
         self._servers.follow(step=pilot.flown, on_ground=False, now_ns=now_ns)
         for session in self._sessions:

@@ -256,7 +256,7 @@ class Failsafe:
         """Whether a packet of the session has arrived within two thirds of the time-out.
 
         A heartbeat arrives at least every third of the time-out (`heartbeat.FEWEST`), so one may be
-        lost. The first arrives a round trip after WELCOME, which may take a second.
+        lost. The first one arrives up to a second (a round trip) after WELCOME.
         """
         return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns * 2 // 3
 

@@ -1,6 +1,6 @@
 """Log events of a vehicle in flight: changes of mode, leaps, the fence, late steps, and the end.
 
-Events on the ground are those of `client.ground`.
+`client.ground` has the events of a vehicle on the ground.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,7 @@
 """Inputs computed from a horizon of inputs or from a spline, eq. (11).
 
 The equations are in `shared.law.rule` and `shared.law.spline`, which the server uses too; here they
-are applied aboard, to all axes of one vehicle. Stages count steps from the first step of a horizon.
+are applied aboard, to all axes of one vehicle. Stage 0 is the first step of a horizon.
 """
 
 import math

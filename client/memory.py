@@ -179,7 +179,7 @@ class ClientMemory:
         return self._saved is not None and self._differs_ns is not None
 
     def keep(self, state: SavedState, *, now_ns: int) -> bytes | None:
-        """Bytes to be written; None if the bytes returned last are recent and still true."""
+        """Bytes to be written; None if the bytes returned last are recent and still up to date."""
         if self._handed is not None:
             handed, handed_ns = self._handed
             is_old = now_ns - handed_ns > self._age_max_ns // REFRESHES

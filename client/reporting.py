@@ -56,7 +56,7 @@ class Reporter:
         self._session: int | None = None
         """Session of the newest observation; None before the first."""
         self._reported: tuple[int, Mode, int] | None = None
-        """Plan in force, mode, and number of repeats of plans, at the newest observation."""
+        """Plan in force, mode, and `Compensator.repeated`, at the newest observation."""
         self._reported_step, self._step = 0, 0
         """Step of the newest observation, and latest step for which `is_due` was called."""
         self._ready: int | None = None

@@ -47,7 +47,7 @@ REFUSED = {
 }
 """Reason for dropping a WELCOME that refuses the vehicle, by the refusal."""
 DEAF = frozenset({Idle.OBSERVATION, Idle.DELAY})
-"""Reasons why a server cannot plan that need not hold for another server."""
+"""Reasons why a server cannot plan although another server may be able to."""
 DEGRADED = "the server misses its deadlines"
 """Reason for the lack of newer plans if the server reports that it is degraded."""
 

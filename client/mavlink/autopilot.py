@@ -108,7 +108,7 @@ class Autopilot:
         return now_ns - since_ns > QUIET_NS
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
-        # The parameters were safe when an earlier run flew the vehicle, since this boot.
+        # An earlier run that has flown the vehicle since this boot has checked its parameters.
         may_fly = self.is_ready or self.positions.is_recalled
         if self.parts is None or not may_fly or self.failure:
             return False
@@ -242,7 +242,7 @@ class Autopilot:
         ]
 
     def _await_clock(self, setup: Setup, now_ns: int) -> None:
-        """Give up if everything except the clock has been ready for too long."""
+        """Give up if the clock is still unknown long after everything else was ready."""
         if not setup.is_done or self.clock.is_known or self._unfit:
             self._set_up_ns = None
         elif self._set_up_ns is None:

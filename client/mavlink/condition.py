@@ -8,9 +8,9 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 ASTRAY_NS = 500 * MILLISECOND_NS
-"""Time for which the estimate has to be bad: its flags flicker when the satellites change."""
+"""Time after which a bad estimate counts: its flags flicker when satellites change."""
 LOW_NS = 2 * SECOND_NS
-"""Time for which the battery has to be low: its voltage sags under thrust."""
+"""Time after which a low battery counts: its voltage sags under thrust."""
 FRESH_NS = 2500 * MILLISECOND_NS
 """Age up to which a heartbeat counts as current: one heartbeat may be lost."""
 NUMBERS = 256

@@ -19,7 +19,7 @@ from skytether.shared.events.flight import address_text
 from skytether.shared.scenario.schema import Scenario
 
 ADDRESSES_REPORTED = 4
-"""Number of foreign addresses reported while the autopilot is silent."""
+"""Largest number of foreign addresses reported while the autopilot is silent."""
 AUTOPILOT_COMPONENT = int(dialect.MAV_COMP_ID_AUTOPILOT1)
 
 

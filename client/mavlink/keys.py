@@ -21,7 +21,7 @@ class MavlinkConfig(Section, frozen=True):
     component: OfVehicle[Annotated[int, Meta(ge=1, le=255)]] = 191
     """MAVLink component number of the client; 191: onboard computer."""
     autopilot: OfVehicle[Annotated[int, Meta(ge=0, le=255)]] = 0
-    """MAVLink system number of the autopilot; 0: that of the first heartbeat."""
+    """MAVLink system number of the autopilot; 0: the system that sends the first heartbeat."""
     positions_hz: OfVehicle[Annotated[int, Meta(ge=5, le=200)]] = 50
     """Rate of positions requested from the autopilot [Hz]."""
     silence_s: OfVehicle[Annotated[float, Meta(ge=0.2, le=5)]] = 0.5

@@ -2,10 +2,10 @@
 
     GROUND → CLIMBING (the steps of its flavour, one after another) → FLYING → LANDING → down
 
-A step is done when the autopilot's own state says so; until then its command is repeated. A vehicle
-is armed only on the ground and only if `armed` is set in the scenario. A mode chosen by somebody
-else is not changed: once the vehicle is armed, the client replaces only a mode that it has set, or
-to which its take-off command led. A pilot returns control with the mode that follows set-points.
+A step is done when the autopilot's state shows it; until then its command is repeated. A vehicle is
+armed only on the ground and only if `armed` is set in the scenario. A mode chosen by somebody else
+is not changed: once the vehicle is armed, the client replaces only a mode that it has set, or to
+which its take-off command led. A pilot returns control with the mode that follows set-points.
 
 A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
 an operator allows arming: a process restarted after a landing must not make the vehicle take off. A
@@ -324,8 +324,8 @@ class Launch:
         return self._has_own_mode(now_ns) and condition.armed and condition.is_fresh(now_ns=now_ns)
 
     def _has_own_mode(self, now_ns: int) -> bool:
-        """Whether nobody else has chosen the present mode. Changes of mode that the client's own
-        commands cause are expected.
+        """Whether the vehicle is in the guided mode, in a mode that the client has set, or in one
+        to which the client's take-off command led.
         """
         mode, flavour = self._condition.mode, self._flavour
         is_high = self._positions.altitude >= self._altitude - LIFTED_M

@@ -50,7 +50,7 @@ class Setpoints:
         self.count = 0
 
     def command(self, velocity: Vector, *, now_ns: int) -> bool:
-        """Adopt the pilot's command. Return whether to send it now: at most at SETPOINTS_MAX_HZ."""
+        """Adopt the pilot's command; return whether to send it now: at most SETPOINTS_MAX_HZ."""
         self._velocity, self._flown_ns = velocity, now_ns
         least_ns = SECOND_NS / SETPOINTS_MAX_HZ
         return self._sent_ns is None or now_ns - self._sent_ns >= 0.9 * least_ns

@@ -115,7 +115,7 @@ class MavlinkVehicle(Vehicle):
             positions.place(origin)
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """Refuse to change a known origin: that would move the fence in flight."""
+        """Refuse to change a known origin, because a change would move the fence in flight."""
         if keys & ORIGIN and self._autopilot.positions.has_origin:
             x, y, z = self._autopilot.positions.origin
             origin_text = f"the origin is known: [{x:.2f}, {y:.2f}, {z:.2f}]"

@@ -26,7 +26,7 @@ class Command(NamedTuple):
 
 
 def point(odometry: Odometry, ahead: float) -> tuple[Vector, Vector]:
-    """Position [m] and velocity [m/s] of the controlled point, in the fixed frame; `ahead`: [m]."""
+    """Position [m] and velocity [m/s], in the fixed frame, of the point `ahead` metres in front."""
     x, y, z = odometry.velocity
     if odometry.child != odometry.frame:
         velocity = from_robot(odometry.rotation, (x, y + ahead * odometry.turn[2], z))

@@ -1,6 +1,6 @@
 """The connection to a robot as an endpoint; topics take the place of the datagrams' addresses.
 
-    in   odometry; commands of other nodes; tokens of the graph, with an empty payload once removed
+    in   odometry; other nodes' commands; tokens that announce other nodes (removed: empty payload)
     out  commands, at each of the pilot's steps; after a landing zeros for ZEROS_NS, then silence
 
 Commands have the type that a subscriber accepts: TwistStamped or Twist. Without a subscriber of one

@@ -61,7 +61,7 @@ class Sensor:
         self._step = 0
 
     def measure(self, state: Array, *, began_ns: int = 0) -> Measurement:
-        """Measurements available at the next step, from step 0 on.
+        """Measurement available at the present step; the first call is step 0, each call one step.
 
         Args:
             state: true position [m] and velocity [m/s] at the step, of each axis; shape (axes, 2).

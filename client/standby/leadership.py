@@ -73,7 +73,7 @@ class Leadership:
         if now_ns - last_ns < self._change_ns:
             return None
         newest = max(filter(self.may_lead, range(self._servers)), key=heard_ns.__getitem__)
-        # The server must have been heard after the leader fell silent: both may be out of reach.
+        # The server was heard after the leader fell silent: otherwise both may be unreachable.
         return newest if heard_ns[newest] >= last_ns + self._ask_ns else None
 
     def hand_over(self, server: int) -> None:
@@ -92,7 +92,7 @@ class Leadership:
             self.hand_over(leads)
 
     def learn(self, number: int, server: int) -> bool:
-        """Adopt a larger number from the server that it makes the leader, if that one may lead."""
+        """Adopt a larger number that makes its sender `server` the leader, if it may lead."""
         is_larger = self.number < number <= min(NUMBER_MAX, self.number + JUMP_MAX)
         if not is_larger or number % self._servers != server or not self.may_lead(server):
             return False
