@@ -1,5 +1,6 @@
 """Ticks of the server in a record, and the packets that left at them."""
 
+import re
 from collections import Counter
 
 import numpy as np
@@ -9,6 +10,8 @@ from skytether.shared.events.flight import FlowOpened
 from skytether.shared.law.model import Flags, Indices
 from skytether.shared.telemetry.record import UPLINK, Record, Rows
 
+CLIENT = re.compile(r"client \d+\.(\d+)")
+"""Name of a client's host in virtual time: seed and vehicle; over UDP a host has an address."""
 PACKETS, PLANS = 400, 50
 """Numbers of first packets and first plans of a vehicle from which `begin_ns` finds tick 0."""
 
@@ -27,11 +30,9 @@ def ticks(server: Rows) -> Indices:
 
 def flows(record: Record) -> dict[int, int]:
     """Vehicle of each flow; empty for flights over UDP, whose records do not name it."""
-    return {
-        each.event.flow: int(each.event.host.rpartition(".")[2])
-        for each in record.events
-        if isinstance(each.event, FlowOpened) and each.event.host.rpartition(".")[2].isdigit()
-    }
+    opened = [each.event for each in record.events if isinstance(each.event, FlowOpened)]
+    named = [(each.flow, CLIENT.fullmatch(each.host)) for each in opened]
+    return {flow: int(client[1]) for flow, client in named if client}
 
 
 def begin_ns(record: Record, dt_ns: int) -> int | None:

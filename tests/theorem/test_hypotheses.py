@@ -22,11 +22,13 @@ from skytether.client.compensator import Compensator
 from skytether.explain import flying
 from skytether.explain.cases import FlightCase
 from skytether.library.flight import Flight
+from skytether.shared.events.flight import FlowOpened
 from skytether.shared.missions.events import LeftMotion, LeftTube
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import Record, trace_hash
 from skytether.sim import flight
 from skytether.theorem.hypotheses import Hypothesis, broken, flown, hypotheses
+from skytether.theorem.judgement import judged
 from skytether.theorem.waits import Wait
 from skytether.view.recordings import report
 
@@ -80,6 +82,18 @@ def test_a_recording_gives_the_same(tmp_path: Path) -> None:
     file = tmp_path / "swap.mcap"
     Flight(EIGHT, eight(), name="swap").save(file)
     assert hypotheses(Flight.load(file).record, EIGHT) == hypotheses(eight(), EIGHT)
+
+
+def test_over_udp_flows_are_of_no_known_vehicle_and_no_waits_are_given() -> None:
+    at_address = [
+        each._replace(event=msgspec.structs.replace(each.event, host="127.0.0.1"))
+        if isinstance(each.event, FlowOpened)
+        else each
+        for each in eight().events
+    ]
+    found = judged(replace(eight(), events=tuple(at_address)), EIGHT)
+    assert found.waits == ()
+    assert found.hypotheses == hypotheses(eight(), EIGHT)
 
 
 def test_a_report_and_the_page_of_a_recording_have_the_table(tmp_path: Path) -> None:
