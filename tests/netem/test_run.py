@@ -572,7 +572,12 @@ class TestEnd:
     def test_its_parent_ends(self) -> None:
         line = argv(of=["sh", "-c", "trap '' HUP; echo up; sleep 1000"])
         with subprocess.Popen(
-            python("import subprocess, sys; subprocess.run(sys.argv[1:])", *line),
+            # Whoever runs the tests under `nohup` ignores SIGHUP.
+            python(
+                "import signal, subprocess, sys; signal.signal(signal.SIGHUP, signal.SIG_DFL); "
+                "subprocess.run(sys.argv[1:])",
+                *line,
+            ),
             stdout=subprocess.PIPE,
             text=True,
         ) as parent:
