@@ -1,4 +1,4 @@
-"""`python -m skytether.netem`: the network as a process."""
+"""`python -m skytether.netem`: the network emulator as a process."""
 
 import sys
 
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
     from skytether.shell.driving.program import Program
 
 NETWORK = "transparent"
-"""Default scenario: without impairments, for packets of any program."""
+"""Default scenario: a network without impairments, for the packets of any program."""
 COLLECT_AFTER = 100_000
-"""Number of new objects after which Python collects garbage. With the default of 700 it would scan
-all queued packets, which are not garbage, many times a second."""
+"""Number of new objects after which Python collects garbage. With the default of 700 the collector
+would scan all queued packets, which are not garbage, many times a second."""
 MTU_MIN, MTU_MAX = 1280, 65_520
-"""Bounds of an MTU: the smallest that IPv6 allows, the largest that slirp4netns accepts [B]."""
+"""Bounds of an MTU [B]: the smallest that IPv6 allows, and the largest that slirp4netns accepts."""
 
 
 @dataclass(frozen=True)
@@ -53,22 +53,22 @@ class NetemOptions(ProcessOptions):
 
     scenario: command.ScenarioName = NETWORK
     """A scenario's name (`skytether list scenarios`) or a .toml file, for its network and seed.
-    With a scenario netem belongs to a flight: a packet's fate depends on the time, not on the
-    packet's number in its flow."""
+    With a scenario, netem emulates the network of a flight: delay and loss of a packet depend on
+    the time, not on the packet's number in its flow."""
     bind: str = "127.0.0.1:47000"
-    """HOST:PORT to listen on for clients; port 0 takes a free one. An IPv6 host is written in
-    brackets, as in [::1]:47000; its socket receives IPv6 only, even for [::]. A name means its IPv4
-    address if it has one."""
+    """HOST:PORT to listen on for clients; with port 0 the system chooses a free port. An IPv6 host
+    is written in brackets, as in [::1]:47000; its socket receives only IPv6, even for [::]. A host
+    name stands for its IPv4 address if it has one."""
     server: str = "127.0.0.1:47001"
     """HOST:PORT of the server; its address family may differ from the clients'."""
     to_client: str | None = None
     """Impairments of packets from the server to clients, joined by &, as in "constant(50ms) &
-    loss(10%)", see `skytether list impairments`; the key network.uplink of a scenario."""
+    loss(10%)", see `skytether list impairments`. Replaces network.uplink of the scenario."""
     to_server: str | None = None
-    """Impairments of packets from clients to the server; the key network.downlink."""
+    """Impairments of packets from clients to the server. Replaces network.downlink."""
     path: Annotated[int, Argument(metavar="N")] = 1
     """Number of the scenario's path to emulate, from 1, see network.paths. The number after the
-    last path is the path to a standby server, impaired like path 1."""
+    last path selects the path to a standby server, which has the impairments of path 1."""
     tcp: bool = False
     """Relay TCP connections instead of UDP: with latency, a rate and cuts, but no packet loss."""
     flows: Annotated[int | None, Argument(metavar="N")] = None
@@ -84,22 +84,22 @@ class RunOptions(ProcessOptions):
     """A scenario's name (`skytether list scenarios`) or a .toml file, for its network and seed."""
     to_program: str | None = None
     """Impairments of packets to the program, joined by &, as in "constant(50ms) & loss(10%)", see
-    `skytether list impairments`; the key network.uplink of a scenario."""
+    `skytether list impairments`. Replaces network.uplink of the scenario."""
     from_program: str | None = None
-    """Impairments of packets from the program; the key network.downlink."""
+    """Impairments of packets from the program. Replaces network.downlink."""
     expose: Annotated[tuple[str, ...], Argument(metavar="PORT", append=True)] = ()
-    """Port of this machine, TCP and UDP, forwarded to the same port of the program; PORT listens
-    on 127.0.0.1, HOST:PORT at another IPv4 address. May be repeated."""
+    """Port of this machine that is forwarded to the same port of the program, for TCP and UDP. PORT
+    alone listens on 127.0.0.1, HOST:PORT on another IPv4 address. May be repeated."""
     mtu: Annotated[int, Argument(metavar="BYTES")] = 1500
     """Largest packet of the program's network device, 1280 to 65520 bytes."""
     path_mtu: Annotated[int | None, Argument(metavar="BYTES")] = None
-    """Largest packet that passes, if below --mtu; longer packets cause an ICMP error."""
+    """Largest packet that passes [bytes], if below --mtu; a longer packet causes an ICMP error."""
 
 
 def emulate(argv: Sequence[str]) -> None:
     """Delay, reorder and lose datagrams between clients and a server, until SIGINT or SIGTERM.
 
-    netem carries any UDP. Clients send to --bind instead of the server:
+    netem carries the UDP packets of any program. Clients send to --bind instead of the server:
 
         skytether netem --bind 127.0.0.1:5000 --server 192.0.2.1:5000
             --to-client "constant(50ms)"
@@ -181,7 +181,7 @@ def emulate_for(argv: Sequence[str]) -> None:
         try:
             passing = min(mtu, path_mtu)
             with program(argv[end + 1 :], mtu, path_mtu=passing, exposed=exposed) as run_:
-                signal.signal(signal.SIGINT, lambda *_: None)  # ignored until this process ends
+                signal.signal(signal.SIGINT, lambda *_: None)  # ignored from here on
                 endpoint = Tunnel(running.scenario, mtu=passing, recorder=running.recorder)
                 running.drive(endpoint, bind=None, waiting_for="", line=run_, on_signal=run_.signal)
         except ProgramError as error:
@@ -190,7 +190,7 @@ def emulate_for(argv: Sequence[str]) -> None:
 
 
 def _exposed(text: str) -> Address:
-    """IPv4 address and port of --expose, from which packets go to the program."""
+    """IPv4 address and port in a value of --expose; packets to it are forwarded to the program."""
     host, colon, _ = text.rpartition(":")
     why = ""
     if host.isdecimal():
@@ -222,7 +222,7 @@ def _end_like(program: "Program") -> None:
 
 
 def _with_directions(options: NetemOptions) -> NetemOptions:
-    """Options whose scenario has only the path --path, with --to-client and --to-server applied.
+    """Options whose scenario has only the path of --path, impaired by --to-client and --to-server.
 
     Raises:
         CommandError: the scenario has no such path.
@@ -236,10 +236,10 @@ def _with_directions(options: NetemOptions) -> NetemOptions:
 def _impaired(
     options: NetemOptions | RunOptions, names: Directions, *, tcp: bool = False
 ) -> Scenario:
-    """Scenario of the options, with the impairments of both directions replaced if given.
+    """Scenario of the options, with the impairments of each direction whose option is given.
 
     Args:
-        names: options of both directions.
+        names: names of the options of both directions.
         tcp: whether connections are relayed.
 
     Raises:
@@ -261,7 +261,7 @@ def _impaired(
 
 def _check_server(server: Address, bind: Address) -> None:
     """Refuse netem's own address as the server's, because packets would circulate."""
-    with suppress(OSError):  # an unknown host is reported when it is used
+    with suppress(OSError):  # an unknown host is reported later, at the first packet to it
         if leads_back(server, bind):
             at = address_text(*server)
             message = f"--server: got {at}, which is netem itself; expected the address of a server"

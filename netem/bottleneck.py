@@ -1,4 +1,4 @@
-"""Bottleneck: a finite rate, which packets of all flows pass one after another after queueing.
+"""Bottleneck: a queue that sends the packets of all flows one after another, at a finite rate.
 
 An idle bottleneck serves a packet at once; otherwise the packet waits in a queue of limited bytes.
 Sizes include the headers of IP and UDP.
@@ -40,7 +40,7 @@ class Codel:
     """Controlled delay (RFC 8289): drops packets more and more often until queueing times fall."""
 
     above_ns: int = 0
-    """Time at which drops begin if queueing times stay too long [ns]; 0 while they are short."""
+    """Time at which drops begin if queueing times stay long [ns]; 0 if they are short."""
     drop_ns: int = 0
     """Time of the next drop [ns]."""
     count: int = 0
@@ -48,7 +48,7 @@ class Codel:
     dropping: bool = False
 
     def drops(self, now_ns: int, *, is_fine: bool) -> bool:
-        """Whether to drop the first packet; `is_fine`: short wait, or queue nearly empty."""
+        """Whether to drop the first packet; `is_fine`: short wait, or a nearly empty queue."""
         late = False
         if is_fine:
             self.above_ns = 0
@@ -90,7 +90,7 @@ class Bottleneck(Generic[T]):
         self._queue = queue
         self._is_fair = queue.serve == "fair"
         self._lines: OrderedDict[int, FlowQueue[T]] = OrderedDict()
-        """Queues with waiting packets, the next to be served first."""
+        """Queues with waiting packets, in the order in which they are served."""
         self._served: Waiting[T] | None = None
         self._done_ns = 0
         self._largest = 0
@@ -99,7 +99,7 @@ class Bottleneck(Generic[T]):
         self.waiting_bytes = 0
         """Size of the waiting packets, headers included [B]."""
         self.dropped: list[T] = []
-        """Dropped packets; the caller counts and removes them."""
+        """Dropped packets; the caller counts them and empties the list."""
         self._pace: _Rate | _Deliveries = (
             _Rate(queue.bytes_per_s) if queue.times_s is None else _Deliveries(queue.times_s)
         )
@@ -170,7 +170,7 @@ class Bottleneck(Generic[T]):
 
     def _is_late(self, queue: FlowQueue[T], packet: Waiting[T], now_ns: int) -> bool:
         waited_ns = now_ns - packet.entered_ns
-        # At a low rate the service of one packet takes over 5 ms, which is no reason to drop it.
+        # At a low rate, sending one packet takes over 5 ms. Such a wait is no reason for a drop.
         target_ns = max(TARGET_NS, round(self._largest / self._queue.bytes_per_s * SECOND_NS))
         # With at most one more packet waiting, a drop would leave the bottleneck idle.
         is_fine = waited_ns < target_ns or queue.bytes <= self._largest
@@ -182,7 +182,7 @@ class Bottleneck(Generic[T]):
         queue.bytes += one * packet.size
         self.waiting_bytes += one * packet.size
         self.waiting += one
-        # The credit of an empty queue is lost: a silent flow cannot save up turns.
+        # The credit of an empty queue is lost, so that a silent flow cannot save up turns.
         if self._is_fair and not queue.packets:
             del self._lines[key]
 
@@ -197,7 +197,7 @@ class _Rate:
 
 
 class _Deliveries:
-    """Rate given by a mahimahi file, which starts with the first packet and is repeated.
+    """Rate by the times in a mahimahi file, counted from the first packet; the file is repeated.
 
     Packets share the bytes of a delivery opportunity; unused bytes are lost.
     """

@@ -1,5 +1,5 @@
-"""Both directions of an emulated network, independent of what it carries: see `proxy` for
-datagrams, `relay` for byte streams and `tunnel` for packets of IP.
+"""Both directions of an emulated network, as a base class: `proxy` carries datagrams, `relay` byte
+streams, and `tunnel` packets of IP.
 
 As in the paper, the uplink leads to the vehicle. Without a vehicle, it leads to a proxy's client or
 a tunnel's program (other names: `shared.endpoints.other_directions`).
@@ -30,9 +30,10 @@ class Emulator(Endpoint):
     Args:
         mtu: largest payload that passes [B].
         directions: names of both directions. With the names FLIGHT a packet's fate depends on its
-            time, because controllers send at different times; otherwise on its number.
+            time, because controllers that are compared send at different times; otherwise on its
+            number in its flow.
         path: number of the session's path, from 0, in the record.
-        header_bytes: see `Link`.
+        header_bytes: size of the headers that precede the payload, see `Link`.
     """
 
     changeable = keys_of(InFlight.IMPAIRMENT)
@@ -56,9 +57,9 @@ class Emulator(Endpoint):
 
         self.uplink, self.downlink = make(UPLINK, "uplink"), make(DOWNLINK, "downlink")
         self._opened = 0
-        """Number of flows opened so far, which is the number of the next flow."""
+        """Number of flows opened so far; also the number that the next flow gets."""
         self._faults: set[str] = set()
-        """Tracebacks of the reported errors of plug-ins: each error is reported once."""
+        """Tracebacks of the errors of plug-ins that were reported; each error is reported once."""
 
     @abstractmethod
     def lanes(self) -> Iterable[tuple[Lane, Lane]]:
@@ -108,7 +109,7 @@ class Emulator(Endpoint):
         *,
         now_ns: int,
     ) -> None:
-        """See `Endpoint`; queued packets keep their fate."""
+        """See `Endpoint`; packets that are already queued keep their delays."""
         self._scenario = scenario
         self.uplink.change(self.impairments("uplink"), now_ns=now_ns)
         self.downlink.change(self.impairments("downlink"), now_ns=now_ns)
@@ -116,7 +117,7 @@ class Emulator(Endpoint):
             up.fates, down.fates = self.fates("uplink", up.flow), self.fates("downlink", down.flow)
 
     def _report(self, fault: str) -> None:
-        """Report a plug-in's error once."""
+        """Report a plug-in's error, given as a traceback or empty; each error only once."""
         if fault and fault not in self._faults:
             self._faults.add(fault)
             self._events.append(Fault(traceback=fault))

@@ -8,8 +8,8 @@ flow, see `netem.impairments.draws`. Packets of a flight that enter in the same 
 fates, by their rank in the slot: otherwise three CLOSEs sent at once would all be lost together.
 Control traffic is so sparse that nearly every packet is the first of its slot.
 
-An impairment of a plug-in that raises an exception, or sets an impossible value, has no effect, so
-that its errors end no flight.
+If an impairment of a plug-in raises an exception or sets an impossible value, it has no effect on
+that packet, and the flight continues.
 """
 
 from collections import Counter
@@ -25,8 +25,8 @@ class Fates:
     """Fates of the packets of one flow in one direction.
 
     Args:
-        by_number: whether a packet's random numbers depend on its number in the flow, not on its
-            slot.
+        by_number: whether a packet's random numbers depend on its number in the flow; else they
+            depend on its slot.
         is_common: whether lasting effects, such as outages, are common to all flows.
     """
 
@@ -49,7 +49,7 @@ class Fates:
         self.fault = ""
         """Traceback of the first error of a plug-in, or empty."""
         self._guarded: Any = None
-        """`guarded.fate_of` if one of the impairments is of a plug-in, else None."""
+        """`guarded.fate_of` if one of the impairments comes from a plug-in, else None."""
         kinds: Counter[str] = Counter()
         names: Counter[str] = Counter()
         for name_, each in of.parts:
@@ -78,8 +78,7 @@ class Fates:
                 or, with `by_number`, in any slot.
         """
         fate = Fate(slot, rank)
-        # Built-in impairments are not guarded: a guard copies the fate for each impairment and
-        # packet.
+        # Built-in impairments are called without the guard, which copies the fate for each of them.
         if self._guarded:
             fate, fault = self._guarded(fate, self._impairments)
             self.fault = self.fault or fault

@@ -20,11 +20,10 @@ if TYPE_CHECKING:
     from skytether.netem.bottleneck import Bottleneck
 
 QUEUE_MAX = 65536
-"""Largest number of packets queued in one direction; further ones count as `overflowed`, not lost.
-"""
+"""Largest number of packets queued in one direction; further packets count as `overflowed`."""
 QUEUE_BYTES_MAX = 64 * 1024 * 1024
-"""Largest UDP payload queued in one direction, whatever `network.mtu` is [B]. With both directions
-full, and Python's overhead, netem uses less than 256 MiB."""
+"""Largest UDP payload queued in one direction [B], whatever `network.mtu` is. If both directions
+are full, netem uses less than 256 MiB, Python's overhead included."""
 
 DELAY_BIN_NS = 20 * MILLISECOND_NS
 """Bin width of the histogram of delays [ns]: the resolution of the paper's delays."""
@@ -35,8 +34,8 @@ ERROR_BIN_NS = MILLISECOND_NS // 50
 QUEUEING_BIN_NS = MILLISECOND_NS
 """Bin width of the histogram of queueing times [ns]."""
 SLICE_BITS = 17
-"""Binary logarithm of the length of a slice of the queue [ns]. A slice of 0.13 ms has 13 packets at
-100 000 packets a second."""
+"""Binary logarithm of the length of a slice of the queue in ns. At 100 000 packets a second a
+slice, 0.13 ms long, has 13 packets."""
 
 
 @dataclass(slots=True)
@@ -49,11 +48,11 @@ class Lane:
     slot: int = -1
     """Time slot of the newest packet, counted from `began_ns`."""
     rank: int = 0
-    """Number of earlier packets in the newest packet's slot; with `Fates.by_number` in the flow."""
+    """Number of earlier packets in the newest packet's slot; with `by_number`, in the flow."""
     taken: int = 0
     """Number of packets so far, lost packets included."""
     newest_out: int = -1
-    """Largest number of the packets that have left, or -1."""
+    """Largest number in the flow of a packet that has left, or -1."""
     latest_ns: int = 0
     """Latest due time of a packet so far [ns]; only used if packets stay in order."""
 
@@ -95,11 +94,11 @@ class Counts:
     depth_max: int = 0
     """Largest number of packets queued at once."""
     delay: Histogram = field(default_factory=lambda: Histogram(DELAY_BIN_NS))
-    """Delays of forwarded packets, as drawn."""
+    """Delays drawn for the forwarded packets."""
     error: Histogram = field(default_factory=lambda: Histogram(ERROR_BIN_NS))
     """Time from a packet's due time until it was forwarded."""
     queueing: Histogram = field(default_factory=lambda: Histogram(QUEUEING_BIN_NS))
-    """Time that each packet spent in the bottleneck."""
+    """Time that each packet spent in the bottleneck, from its entry until it was sent."""
 
 
 QueuedPacket = tuple[int, int, Datagram, int, Lane, int, int, bool]
@@ -119,7 +118,7 @@ class Queue:
         self.front: list[QueuedPacket] = []
         """Heap of the packets due first; empty only if the queue is empty."""
         self._slice = 0
-        """Number of the slice in `front`, which also has all packets of earlier slices."""
+        """Number of the slice in `front`; earlier packets are in `front`, too."""
         self._later: dict[int, list[QueuedPacket]] = {}
         self._slices: list[int] = []
         self.size = 0
@@ -189,7 +188,7 @@ class Link:
         self.counts = Counts()
 
     def change(self, impairments: Impairments, *, now_ns: int) -> None:
-        """Use other impairments. If the rate changes, packets at the bottleneck queue again."""
+        """Use other impairments. If the queue changes, waiting packets enter the new queue."""
         self._pass(now_ns)
         previous, self.impairments = self.impairments, impairments
         self._is_ordered = impairments.is_ordered
@@ -260,7 +259,7 @@ class Link:
     ) -> None:
         """Lose a packet that has passed the bottleneck, or queue it until it is due."""
         counts, due_ns, size = self.counts, now_ns + fate.delay_ns, len(datagram.payload)
-        # Lost after the bottleneck, because a lost packet uses the rate as well.
+        # A packet is lost only after the bottleneck, because lost packets use its rate, too.
         if fate.lost:
             counts.lost += 1
             self._record_lost(lane, number, size, entered_ns, due_ns - entered_ns)

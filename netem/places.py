@@ -2,11 +2,12 @@
 
 netem reads no payload, so it cannot distinguish a vehicle from an attacker who repeats a vehicle's
 packets. netem counts exchanges instead. An exchange is a packet of the client followed by one of
-the server; EXCHANGES of them earn a flow its place for EARNED_NS. One answer is not enough, because
-anybody can cause one. If no place is free, a new client replaces the first of these:
+the server; EXCHANGES exchanges earn a flow its place for EARNED_NS. One exchange is not enough,
+because anybody can make the server answer once. If no place is free, a new client replaces the
+first of these that exists:
 
     1. the oldest unearned flow, if it is unused for IDLE_NS
-    2. the oldest unearned flow of the new client's own host, if that has more than HOST_FLOWS
+    2. the oldest unearned flow of the new client's host, if that host has over HOST_FLOWS flows
     3. if fewer than one place in TRIALS is unearned: the oldest flow of another host that has
        earned more than HOST_FLOWS places
     4. the oldest unearned flow of a host with more than HOST_FLOWS such flows
@@ -23,7 +24,8 @@ from skytether.netem.link import Lane
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address
 
-# A vehicle and its server each send a packet at least three times within `link.timeout_s`.
+# These values suit vehicles: a vehicle and its server each send at least three packets within
+# `link.timeout_s`.
 EXCHANGES = 8
 """Number of exchanges that earn a flow its place."""
 EARNED_NS = 10 * SECOND_NS
@@ -33,7 +35,7 @@ IDLE_NS = 5 * SECOND_NS
 HOST_FLOWS = 64
 """Number of flows above which a host's flows are replaced before those of other hosts."""
 TRIALS = 8
-"""Inverse of the share of places that hosts with over HOST_FLOWS flows must leave to others."""
+"""Hosts with over HOST_FLOWS flows must leave one place in TRIALS to other hosts."""
 
 
 @dataclass(slots=True)
@@ -50,7 +52,7 @@ class Flow:
     order: "Order"
     """Order that contains this flow: `Places._earned` or `Places.others`."""
     laps: int
-    """Number of earlier addresses with the same first packet, see `Proxy._laps`."""
+    """Number of earlier addresses that sent the same packet as the flow's first."""
     asks: bool = False
     """Whether a packet of the client has arrived since the newest exchange."""
     exchanges: int = 0
@@ -136,7 +138,7 @@ class Places:
         return flow
 
     def _crowding(self, host: str) -> Flow | None:
-        """Flow that a new client of `host` replaces, of a host with more than HOST_FLOWS flows."""
+        """Flow that a new client of `host` replaces, if a host has over HOST_FLOWS flows."""
         earned, others = self._earned, self.others
         if earned.count(host) + others.count(host) > HOST_FLOWS and others.count(host):
             return others.oldest(host)

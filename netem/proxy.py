@@ -4,10 +4,10 @@ Clients send to netem's bound socket. Each client address is a flow with its own
 server, so that the server's answers are sent back to the right client. As in the paper, uplink is
 server to client, downlink is client to server.
 
-If no place is free for a new client, it replaces a flow chosen by `places`. A server address that
-leads back to netem is detected: before the server's first packet, a packet that has arrived from
-LAPS_MAX new addresses, one after another, opens no further flow. The first packet that is too long,
-and the first that does not reach the server, are reported.
+If no place is free, a new client replaces a flow that `places` chooses. netem detects a server
+address that leads back to netem itself: before the server's first packet, a packet that has arrived
+from LAPS_MAX new addresses, one after another, opens no further flow. netem reports the first
+packet that is too long, and the first that does not reach the server.
 """
 
 from collections import OrderedDict
@@ -69,11 +69,11 @@ class Proxy(Emulator):
         self._is_unreachable = False
         """Whether a packet to the server could not be delivered since the server's last answer."""
         self._passed: OrderedDict[int, tuple[int, Address]] = OrderedDict()
-        """Result of `_laps` and latest client of each of the newest packets, by Python's hash of
-        the payload (64 bits, with a secret key of the process); empty after the server's answer."""
+        """Number of new addresses (`_laps`) and latest client of each of the newest packets, by
+        Python's keyed hash of the payload (64 bits); empty after the server's first answer."""
         self.refused = 0
-        """Number of dropped packets: from clients without a flow, or to a flow's socket from others
-        than the server."""
+        """Number of dropped packets: of clients that got no flow, and of senders other than the
+        server to a flow's socket."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         payload, peer, socket = datagram
@@ -109,7 +109,7 @@ class Proxy(Emulator):
             self._forward(now_ns)
 
     def undelivered(self, socket: int, reason: str) -> None:
-        """See `Endpoint`; undelivered packets to clients, which come and go, are only counted."""
+        """See `Endpoint`; undelivered packets to clients, which may have ended, are counted."""
         counts = self.downlink.counts if socket else self.uplink.counts
         counts.forwarded -= 1
         counts.undelivered += 1
@@ -148,7 +148,7 @@ class Proxy(Emulator):
     def _laps(self, datagram: Datagram) -> int:
         """Number of new addresses, one after another, from which the same packet has arrived.
 
-        Many of them, before any answer of the server, mean that netem's own packets return to it.
+        Many such addresses before the server's first answer mean that netem's packets come back.
         """
         passed = self._passed.get(hash(datagram.payload)) if not self._is_answered else None
         if passed is None:
@@ -174,7 +174,7 @@ class Proxy(Emulator):
 
 
 def merged(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Figures of one session's netems, one for each path, combined as if of one netem.
+    """Figures of the netems of a session's paths, combined in the form of one netem's figures.
 
     Counts of several paths are added up, and `by_path` has the figures of each, from 1.
     """
@@ -184,7 +184,7 @@ def merged(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _added(each: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Sums of the counts with the same name, also in groups; without quantiles and maxima."""
+    """Sums of the counts of the same name, also within groups, without quantiles and maxima."""
     total: dict[str, Any] = {}
     for name in dict.fromkeys(name for one in each for name in one):
         values = [one[name] for one in each if name in one]

@@ -3,11 +3,11 @@
 A stream has no packets that could be lost. Each piece of a stream passes the same impairments as a
 packet; a piece that would be lost holds up its stream and is tried again every RETRY_NS, similar to
 a retransmission. Pieces never overtake each other, and are neither copied nor damaged. While a
-queue is full, nothing is read from its connections. So TCP never sees a packet loss here; only
-emulation of its packets shows its reaction to loss, see `netem.tunnel`.
+queue is full, nothing is read from its connections. So no TCP connection sees a packet loss here;
+`netem.tunnel` emulates the packets of TCP, and shows its reaction to losses.
 
-The ends of connection N are the peers `(CLIENT, N)` and `(SERVER, N)`; an empty piece means that an
-end sends no more.
+The ends of connection N are the peers `(CLIENT, N)` and `(SERVER, N)`. An empty piece means that
+its sender has closed its side.
 """
 
 from collections import deque
@@ -30,14 +30,14 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 TRY = 1 << 32
-"""Number added to a piece's number at each new try, so that the try has its own random loss."""
+"""Number added to a piece's number at each new try, so that each try has a new random loss."""
 RETRY_NS = 200 * MILLISECOND_NS
 """Time after which a piece that a link would have lost is sent again [ns]: the smallest
 retransmission time-out of Linux."""
 
 
 class LosslessFates(Fates):
-    """Fates of the pieces of a stream: delays only."""
+    """Fates of the pieces of a stream: pieces are delayed, but not lost, copied or damaged."""
 
     def at(self, slot: int, rank: int = 0) -> Fate:
         return replace(super().at(slot, rank), lost=False, copies=0, flipped=None)
@@ -49,11 +49,11 @@ class HalfConnection:
     def __init__(self, lane: Lane, link: Link) -> None:
         self.lane, self.link = lane, link
         self.held: deque[Datagram] = deque()
-        """Pieces that have not entered the link."""
+        """Held pieces: pieces that have not entered the link, the oldest first."""
         self.tries = 0
-        """Number of times that the first held piece would have been lost."""
+        """Number of tries at which the first held piece would have been lost."""
         self.retry_ns: int | None = None
-        """Time at which the first held piece is tried again; None while it waits for space."""
+        """Time at which the first held piece is tried again [ns]; None while it waits for space."""
 
     def loses(self, now_ns: int) -> bool:
         """Whether the first held piece would be lost now if it were a packet."""
@@ -81,7 +81,7 @@ class Relay(Emulator):
         super().__init__(scenario, mtu=PIECE_BYTES, directions=RELAY, recorder=recorder, path=path)
         self._server = server
         self._streams: dict[Address, HalfConnection] = {}
-        """Streams by their source."""
+        """One direction of each connection, by the peer that sends it."""
         self._holding: dict[Address, HalfConnection] = {}
         """Streams with held pieces, in the order in which they are tried."""
         self._ended: set[Address] = set()
@@ -107,7 +107,7 @@ class Relay(Emulator):
         self._events.append(FlowOpened(flow=up.flow, host=CLIENT, port=number))
 
     def _admit(self, source: Address, stream: HalfConnection, now_ns: int) -> None:
-        """Let held pieces of a stream enter its link, until one of them has to wait."""
+        """Let held pieces of a stream enter its link, until a piece has to wait."""
         self._holding.pop(source, None)
         while stream.held:
             if not stream.link.has_room(len(stream.held[0].payload)):
@@ -182,7 +182,7 @@ class Relay(Emulator):
 
 
 def objection(scenario: Scenario) -> str:
-    """Why byte streams cannot pass the network of a scenario, in words; empty if they can."""
+    """Reason why byte streams cannot pass the network of a scenario; empty if they can."""
     for key, of in zip(KEYS, (scenario.uplink, scenario.downlink), strict=True):
         if names := _only_packets(of):
             expected = "impairments that streams can have, because TCP is relayed as a stream"

@@ -18,14 +18,15 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Recorder
 
 FLOWS_MAX = 16_384
-"""Largest number of flows stored; a further one replaces the flow that was silent longest."""
+"""Largest number of flows stored; a further flow replaces the flow that was silent longest."""
 
 
 class Tunnel(Emulator):
     """Delays, reorders and loses packets between a program and the outside.
 
     A datagram's peer is PROGRAM or OUTSIDE, and its payload a packet of IP; an empty payload means
-    that the peer has ended. The tunnel ends with OUTSIDE, or after the program's last packets.
+    that the peer has ended. The tunnel ends when OUTSIDE ends, or when PROGRAM has ended and its
+    last packet has left.
 
     Args:
         mtu: largest packet that passes [B]; the program gets an ICMP error for a longer one.
@@ -39,9 +40,9 @@ class Tunnel(Emulator):
 
         A flow is all packets, both ways, with the same protocol, addresses and ports."""
         self._began_ns = 0
-        """Time of the first packet [ns], at which outages and traces begin for all flows."""
+        """Time of the first packet [ns]; outages and traces of all flows count from this time."""
         self._has_ended = self._is_cut = False
-        """Whether an empty payload has arrived: from PROGRAM, and from OUTSIDE."""
+        """Whether an empty payload has arrived from PROGRAM, and whether one has from OUTSIDE."""
         self.refused = 0
         """Number of packets that were not IP packets."""
 

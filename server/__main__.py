@@ -53,17 +53,17 @@ class ServerOptions(ProcessOptions):
             metavar="HOST:PORT",
             append=True,
             help="HOST:PORT to listen on, by default 127.0.0.1:47001; may be repeated, for one to "
-            "four addresses. Port 0 takes a free one. An IPv6 host is written in brackets, as in "
-            "[::1]:47001; its socket receives IPv6 only, even for [::]. A name means its IPv4 "
-            "address if it has one.",
+            "four addresses. With port 0 the system chooses a free port. An IPv6 host is written "
+            "in brackets, as in [::1]:47001; its socket receives only IPv6, even for [::]. A host "
+            "name stands for its IPv4 address if it has one.",
         ),
     ] = ()
     vehicles: Annotated[int, Argument(metavar="N")] = VEHICLES_MAX
     """Largest number of vehicles at once, per worker."""
     workers: Annotated[int, Argument(metavar="N")] = 1
-    """Number of processes that share the address and the vehicles; one per core is best. With
-    several, each writes its own numbered files, as in RECORD.1 or RECORD.1.mcap, and worker N
-    serves metrics at PORT + N - 1."""
+    """Number of worker processes, which share the address and the vehicles; one per core is best.
+    With several workers each writes its own numbered files, as in RECORD.1 or RECORD.1.mcap, and
+    worker N serves metrics at PORT + N - 1."""
     keys: Path | None = None
     """File with the keys of all vehicles, made by `skytether keygen`. Without keys the link is
     plaintext, which is refused if other machines can reach the address."""
@@ -111,11 +111,12 @@ def serve(argv: Sequence[str]) -> None:
 
 
 def _ready(scenario: Scenario) -> None:
-    """Load the compiled planner and all modules that a vehicle's packet may need: before workers
-    are forked, so that they share memory, and before the first tick, so that it is on time.
+    """Load the compiled planner and all modules that a vehicle's packet may need. This is done
+    before workers are forked, so that they share the memory, and before the first tick, so that the
+    tick is on time.
     """
     for room in (assignment.ROOM, routes.ROOM):
-        with suppress(ConfigError):  # without the module, its messages are refused
+        with suppress(ConfigError):  # messages of a module that is missing are refused
             load(room, "a message")
     others = loading.others(scenario)
     terminal.prepare(machine_code.missing(without=others))

@@ -1,6 +1,6 @@
 """Assignment of vehicles to a server; in this base class the server plans for all vehicles.
 
-`server.standby` replaces it once a vehicle reports that it has two servers.
+The class in `server.standby` replaces this class once a vehicle reports that it has two servers.
 """
 
 from collections.abc import Iterable
@@ -13,7 +13,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import Message, Observation, RoomMessage
 
 ROOM, MESSAGES = "skytether.server.standby", "skytether.shared.wire.lead"
-"""Module for vehicles with two servers, and module of the messages of such vehicles."""
+"""Names of the module for vehicles with two servers, and of the module with their messages."""
 
 
 class Decider(Protocol):
@@ -29,7 +29,7 @@ class Decider(Protocol):
         """Forget everything about the vehicle of a row."""
 
     def restart(self, row: int) -> bool:
-        """Note a client's restart without saved state; return whether to report it."""
+        """Note that a client has restarted without saved state; return whether to report this."""
 
     def observe(self, row: int, observation: Observation) -> bool:
         """Store an observation unless a newer one is stored; True if stored."""
@@ -50,7 +50,7 @@ class Assignment:
 
     def __init__(self, controller: Decider, limits: Any) -> None:
         self.controller, self.limits = controller, limits
-        """Limits of motions, see `Scheme.limits`; None if not all vehicles need the same leader."""
+        """Limits of motions, see `Scheme.limits`; None if vehicles may have different leaders."""
         self.changes = 0
         """Number of changes of `limits` in flight."""
         self.changed_ns: int | None = None
@@ -62,11 +62,11 @@ class Assignment:
             self.changes += 1
 
     def takes(self, message: Message) -> bool:
-        """Whether a message is about which server plans for a vehicle."""
+        """Whether a message says which server plans for a vehicle."""
         return type(message).__module__ == MESSAGES
 
     def of_several(self) -> "Assignment":
-        """Assignment if some vehicles have several servers."""
+        """Assignment that replaces this one when a vehicle has several servers."""
         assignment: Assignment = load(ROOM, "a standby server").AssignmentOfTwo(self)
         return assignment
 
@@ -87,5 +87,5 @@ class Assignment:
         return plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterable[Datagram]:
-        """Datagrams about the servers, due once a second; none in this base class."""
+        """Datagrams to vehicles about this server's limits, due once a second; none here."""
         return ()

@@ -5,7 +5,7 @@ bytes, in this order:
 
 1. urgent packets: a plan that replaces a heartbeat, and the first plan of a vehicle. They are
    always granted, like heartbeats, and leave fewer bytes for the others;
-2. vehicles that got no packet for WAIT_S, longest wait first, so that none is neglected;
+2. vehicles that got no packet for WAIT_S, the longest wait first, so that each gets plans;
 3. all other vehicles, those with the largest figure of the trigger per byte first.
 
 The budget is a token bucket with b bytes: b ← b + r Δt, within ± r BURST_S, minus the bytes sent,
@@ -30,7 +30,7 @@ BURST_S = 0.1
 WAIT_S = 1.0
 """Time without a packet after which a vehicle takes precedence [s]."""
 NEVER = -2
-"""Value of `_asked` for a vehicle without a refused request; less than any tick's number."""
+"""Value of `_asked` for a vehicle without a refused request: less than any tick's number."""
 GUESS_BYTES = 100
 """Assumed size of a packet, with headers, until the first is sent [B]."""
 
@@ -53,9 +53,9 @@ class SharedBudget:
         self._asked = np.full(capacity, NEVER)
         """Number of the tick of each vehicle's latest refused request; shape (capacity,)."""
         self._gain = np.zeros(capacity)
-        """Figure of the trigger at the latest request, per byte of a packet; shape (capacity,)."""
+        """Figure of the trigger at the latest decision, per byte of a packet; shape (capacity,)."""
         self._waited_s = np.zeros(capacity)
-        """Time since the last packet if WAIT_S or more, otherwise 0 [s]; shape (capacity,)."""
+        """Time since the last packet [s], or 0 if less than WAIT_S; shape (capacity,)."""
         self.deferred = 0
         """Number of refused requests."""
 
@@ -92,8 +92,8 @@ class SharedBudget:
         # np.lexsort sorts by its last key first: longest wait, then largest gain.
         order = np.lexsort((-self._gain[waiting], -self._waited_s[waiting]))
         ranked = waiting[order]
-        # After the first request that exceeds the budget, none is granted: otherwise smaller
-        # packets could overtake it for ever.
+        # After the first request that exceeds the budget, no further request is granted: otherwise
+        # smaller packets could always overtake a large one.
         goes = ranked[np.cumsum(self._bytes[ranked]) <= left]
         chosen = urgent & event | np.isin(rows, goes) & asks
         late = int(asks.sum() - (chosen & asks).sum())
@@ -102,7 +102,7 @@ class SharedBudget:
         return chosen
 
     def charge(self, row: int, packet: Sequence[Datagram], *, is_plan: bool) -> None:
-        """Subtract the bytes of a packet with its copies; `is_plan`: False for a heartbeat."""
+        """Subtract the bytes of a packet and its copies. `is_plan` is False for a heartbeat."""
         # The network also carries headers of IP and UDP: 28 bytes, more than a whole heartbeat.
         size = sum(len(each.payload) + HEADER_BYTES for each in packet)
         self._spent += size

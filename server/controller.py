@@ -4,8 +4,8 @@
     (`mpc.hierarchical`) → event? (`trigger`) → plans are sent and remembered.
 
 The schemes "predictive" and "none" have d = 0. With "trajectory", `schemes.trajectory` plans the
-spline that the vehicle follows; on a mission, `missions.mission_planner` does. The server plans for
-every vehicle at every step, because planning takes a small part of a step's time.
+spline that the vehicle follows; on a mission, `missions.mission_planner` plans motions. The server
+plans for every vehicle at every step, because planning takes a small part of a step's time.
 """
 
 from collections import Counter
@@ -46,14 +46,14 @@ if TYPE_CHECKING:
 PLANS, OBSERVATION, DELAY, UNSOLVED, OTHER_SERVER = map(int, Idle)
 BLOCK = 128
 """Number of vehicles planned for together. Their data fit into the cache, and each array is below
-128 KiB; for a larger one the C library requests new memory from the kernel every time."""
+128 KiB; for a larger array the C library requests new memory from the kernel at each allocation."""
 
 
 class Decisions(msgspec.Struct, frozen=True):
     """Plans and decisions for n vehicles at a step; valid until the next decisions are made."""
 
     batch: Batch
-    """The vehicles, their predictions, and those to which a plan is sent."""
+    """The vehicles, their predictions, and the indices of the vehicles to which a plan is sent."""
     figures: Figures
     planned: Array
     """Planned state x_p(k+d|k-1) [m, m/s]; shape (n, axes, 2)."""
@@ -84,7 +84,7 @@ class Controller:
         self._clock = clock
         self.desired = Desired(scenario, terms, capacity, block, references)
         self.faults: list[str] = []
-        """Tracebacks that are not reported yet, of the first error of each plug-in."""
+        """Traceback of the first error of each plug-in, until it is reported."""
         fleet = Fleet(
             scenario,
             terms,
@@ -108,7 +108,7 @@ class Controller:
         """Whether a heartbeat to each vehicle is due at this tick; shape (capacity,)."""
         self._heartbeats = False
         self._able = np.zeros(capacity, dtype=np.bool_)
-        """Scratch array for `able`; shape (capacity,)."""
+        """Scratch array of `able`: whether to plan for a vehicle; shape (capacity,)."""
         self._all, self._none = np.arange(block), np.arange(0)
         self.change_trigger(control)
         self._stopwatch = stopwatch
@@ -117,7 +117,7 @@ class Controller:
         self.observed_step = self.scheme.observed_step
         """Step of the newest observation of each vehicle, or -1; shape (capacity,)."""
         self.idle = np.zeros(capacity, dtype=np.int64)
-        """Why each vehicle gets no plan, as a value of `Idle`; shape (capacity,)."""
+        """Reason why each vehicle gets no plan, as a value of `Idle`; shape (capacity,)."""
         self._is_own = np.ones(capacity, dtype=np.bool_)
         """Whether this server plans for each vehicle; shape (capacity,)."""
         self._plans_due: dict[int, int] = {}
@@ -148,10 +148,10 @@ class Controller:
         self.faults += filter(None, [fault])
 
     def use_trigger(self, trigger: Trigger) -> None:
-        """Use another trigger from the next step on; it knows no plans sent before."""
+        """Use another trigger from the next step on. The new trigger knows no earlier plans."""
         terms, self._trigger = self._terms, trigger
         self.doubts = trigger.doubts
-        """Whether the trigger needs the costs for cases in which horizons are lost."""
+        """Whether the trigger needs the costs for the cases that horizons in flight are lost."""
         self._foresight = self.scheme.make_foresight(doubts=trigger.doubts)
         self._trigger_inputs = SituationArrays(
             model=terms.model,
@@ -211,8 +211,8 @@ class Controller:
         return is_stored
 
     def begin_tick(self, tick_ns: int, now_ns: int, due: list[int]) -> None:
-        """Begin the tick of the time `tick_ns`; `due`: rows of the vehicles that get a heartbeat at
-        this tick unless they get a plan.
+        """Begin the tick of the time `tick_ns`. `due` has the rows of the vehicles that get a
+        heartbeat at this tick unless they get a plan.
         """
         self.desired.tick(tick_ns)
         if self._budget:
@@ -223,7 +223,7 @@ class Controller:
             self._heartbeats = bool(due)
 
     def able(self, rows: Indices, step: Indices) -> tuple[Indices, Indices]:
-        """Vehicles with a new step and no reason to be idle, and their steps."""
+        """Vehicles to plan for, and their steps: those with a new step and no reason in `idle`."""
         n, able = len(rows), self._able
         if n == _able(
             rows,
@@ -241,7 +241,7 @@ class Controller:
         return rows[able[:n]], step[able[:n]]
 
     def decide(self, rows: Indices, step: Indices) -> Decisions:
-        """Plan for at most BLOCK vehicles from `able`, and decide whose horizon is sent.
+        """Plan for at most BLOCK vehicles from `able`, and decide to which a horizon is sent.
 
         Source: algorithms 1, 2.
         """
@@ -277,7 +277,7 @@ class Controller:
         # After the budget's choice: the scheme "committed" must replay only horizons that are sent.
         self.scheme.remember(rows, step, predicted, event)  # eq. (12)
         _note_sent(rows, step, event, self._sent_step)
-        if events == n:  # no vehicle has to be left out
+        if events == n:  # plans go to all vehicles: no selection, which would copy arrays
             sent = self._all[:n]
             self._trigger.sent(rows, figures)
         elif events:
@@ -315,7 +315,7 @@ def _able(
     idle: I1,
     able: B1,
 ) -> int:
-    """Fill in `able`, and `idle` of vehicles with a new step; return the number of `able` ones."""
+    """Fill in `able`, and `idle` of vehicles with a new step; returns how many are able."""
     count = 0
     for i in range(len(rows)):
         row, step = rows[i], steps[i]
@@ -328,7 +328,7 @@ def _able(
         elif step - observed_step[row] > age_max:
             idle[row] = OBSERVATION
         elif shortest_ns(seen, row) > uplink_max:
-            # A horizon would have ended on arrival, or the vehicle would refuse it as too late.
+            # A horizon would end before it arrives, or the vehicle would refuse it as too late.
             idle[row] = DELAY
         able[i] = idle[row] == PLANS
         count += able[i]
@@ -348,10 +348,10 @@ def _withhold(
     idle: I1,
     event: B1,
 ) -> tuple[int, int]:
-    """Cancel events with unusable plans, noting why in `idle`, and set `last_step`.
+    """Cancel events whose plan cannot be used, and set `last_step` to the present step.
 
-    A plan is unusable if its observation would be too old at the plan's start, or if the vehicle
-    does not accept horizons.
+    An event is cancelled if its plan has no solution, if the plan's observation would be too old at
+    the plan's start, or if the vehicle does not accept horizons. `idle` gets the first two reasons.
 
     Returns:
         number of vehicles without a solution, and of remaining events.

@@ -37,8 +37,8 @@ from skytether.shared.wire.protocol import CLOSES, Close, Refusal, encode
 VEHICLES_MAX = 64
 """Default largest number of vehicles at once."""
 LATEST_NS = 2 * SECOND_NS
-"""Time for which a server that has to end waits, after the last motion, for observations which show
-that the vehicles are at rest [ns]."""
+"""Time that a server which has to end waits, after the last motion has ended, for observations
+which show that the vehicles are at rest [ns]."""
 TICK_EDGES_MS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 """Bin edges of the histogram of tick durations [ms]."""
 
@@ -55,8 +55,8 @@ class Server(Endpoint):
         recorder: receives one row per tick and vehicle.
         plan_recorder: receives one row per horizon sent, see `record.plan_columns`.
         stopwatch: measures the parts of a tick; the server itself reads no clock.
-        references: function from a vehicle's number to its reference; default: the scenario's
-            reference for all.
+        references: function from a vehicle's number to its reference; by default all vehicles have
+            the scenario's reference.
         planning: function that calls planners of plug-ins.
     """
 
@@ -129,7 +129,7 @@ class Server(Endpoint):
         self._dt_ns = terms.dt_ns
         self._ticked_ns = 0
         self._expire_ns = 0
-        """Time of the next check for silent vehicles."""
+        """Time of the next check for silent vehicles [ns]."""
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
         self._reception.hear(datagram, now_ns=now_ns)
@@ -180,7 +180,7 @@ class Server(Endpoint):
                 self._out += session.sealed(encode(close), now_ns)
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:
-        """See `Endpoint`; narrows the clock offsets of vehicles that report the time of day."""
+        """See `Endpoint`; narrows clock bounds of vehicles that report the time of day."""
         self._reception.time = TimeOfDay(utc_ns - now_ns, error_ns, now_ns)
 
     def change(self, scenario: Scenario, keys: frozenset[str], *, now_ns: int) -> None:

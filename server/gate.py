@@ -38,15 +38,15 @@ class Gate(Protocol):
         """
 
     def repeated(self, datagram: Datagram) -> int | None:
-        """Number of the vehicle whose recent packet a datagram repeats; None if the datagram
-        repeats none.
+        """Number of the vehicle whose recent packet a datagram repeats; None if it repeats no
+        packet.
         """
 
     def admit(self, call: GateCall, *, now_ns: int) -> None:
         """Accept the sender of this HELLO: from now on the gate decrypts the sender's packets."""
 
     def outbox(self) -> list[Datagram]:
-        """Datagrams that the gate itself sends; each is returned once."""
+        """Datagrams that the gate itself has to send; each datagram is returned only once."""
 
 
 class PlainGate:

@@ -7,7 +7,7 @@
     delays, distributions      random delays
     losses, outages, damage    packets lost, at random or for a time; duplicated and corrupted
     queues                     finite rates and order, for `netem.bottleneck`
-    traces                     recorded networks, by `shared.formats.recorded`
+    traces                     recorded networks, read by `shared.formats.recorded`
 
 Each impairment is a class, imported when a scenario names it. The package imports only `shared`.
 """

@@ -54,9 +54,9 @@ class Constant(Delay):
 
 @impairment(name="paper")
 class Paper(Delay):
-    """Delays by minimum_s + slot_s · Poisson(slots_mean): the paper's law, as corrected (E1, E2).
+    """Delays by minimum_s + slot_s · Poisson(slots_mean): the paper's delays, corrected.
 
-    Source: eq. (17).
+    Source: eq. (17), with the corrections E1 and E2 of docs/paper.md.
     """
 
     def __init__(
@@ -81,13 +81,13 @@ def _poisson(mean: float) -> tuple[int, Sequence[float]]:
     """Cumulative probabilities of a Poisson distribution, except values near 0 and near 1.
 
     Returns:
-        number n of the first probability, and the probabilities P(N ≤ n), P(N ≤ n + 1), …
+        smallest number n, and the probabilities P(N ≤ n), P(N ≤ n + 1), …
     """
     if mean == 0.0:  # avoids log(0)
         return 0, (1.0,)
     wide = 10.0 * sqrt(mean) + 20.0
     numbers = range(max(0, floor(mean - wide)), floor(mean + wide))
-    # In logarithms, as mean^m and m! overflow for large means. The paper prints m for m! (E1).
+    # In logarithms, because mean^m and m! overflow for large means. The paper has m for m! (E1).
     logs = [number * log(mean) - mean - lgamma(number + 1.0) for number in numbers]
     cumulative = np.cumsum(np.exp(logs))
     return numbers[0], (cumulative / cumulative[-1]).tolist()

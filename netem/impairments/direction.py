@@ -1,8 +1,8 @@
 """Impairments of one direction of the network, from a text such as `constant(0.05) & loss(0.1)`.
 
 Every packet first passes the queue of `rate` or `deliveries`, if there is one. Then the other
-impairments act on the packet, with random numbers for the time at which it entered: delays add up,
-and one impairment suffices to lose it.
+impairments act on the packet: their delays add up, and one impairment suffices to lose the packet.
+Their random numbers are those of the time at which the packet entered.
 """
 
 from functools import lru_cache
@@ -19,7 +19,7 @@ PARTS_MAX = 16
 
 
 class Impairments:
-    """Impairments of one direction, made from parsed calls and the files that these name.
+    """Impairments of one direction, made from parsed calls and the files that the calls name.
 
     Raises:
         GrammarError: an impairment refuses its arguments, or there are two queues.

@@ -14,8 +14,8 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 
 _NORMAL = NormalDist()
 _TAIL = 2.0**-54
-"""Smallest probability at which the normal quantile is evaluated: half the resolution of a uniform
-number."""
+"""Smallest probability at which the normal quantile is evaluated, because the quantile of 0 is
+infinite: half the resolution of a uniform random number."""
 
 
 @impairment(name="uniform")
@@ -51,7 +51,7 @@ class Normal(Delay):
 
 @impairment(name="lognormal")
 class Lognormal(Delay):
-    """Delays by least_s plus a lognormal time; mean_s and sd_s are those of the total."""
+    """Delays by least_s plus a lognormal time; mean_s and sd_s are those of the sum."""
 
     def __init__(self, least_s: Time, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
         super().__init__(correlation_s)
@@ -68,7 +68,7 @@ class Lognormal(Delay):
 
 @impairment(name="gamma")
 class Gamma(Delay):
-    """Delays by least_s plus a gamma-distributed time; mean_s and sd_s are those of the total."""
+    """Delays by least_s plus a gamma-distributed time; mean_s and sd_s are those of the sum."""
 
     def __init__(self, least_s: Time, mean_s: Time, sd_s: Time, correlation_s: Time = 0.0) -> None:
         super().__init__(correlation_s)
@@ -110,7 +110,7 @@ def _over(least_s: float, mean_s: float) -> float:
 
 @lru_cache(maxsize=64)
 def _gamma(shape: float) -> tuple[Sequence[float], Sequence[float]]:
-    """Cumulative probabilities of a gamma distribution of scale 1, and their values.
+    """Cumulative probabilities P(X ≤ x) of a gamma distribution of scale 1, and the values x.
 
     The density is integrated over x^shape if shape < 1, where it is unbounded in x, and over x
     otherwise.

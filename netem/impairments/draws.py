@@ -5,10 +5,10 @@ SLOT_NS in which it enters, counted from the start of the flow. It does not depe
 packets. So two controllers are compared on the same network, even if they send at different rates.
 Packets of one flow in one slot are numbered by rank.
 
-Two runs of any other program send the same packets, but never in the same milliseconds. So a
-packet's rank is then its number in its flow, and its own random numbers depend on that number.
-Lasting effects depend on the time since the flow's first packet, or, if they are common to all
-flows of a program (`netem.tunnel`), since the program's first packet.
+Two runs of any other program send the same packets, but never in the same milliseconds. So for
+other programs a packet's rank is its number in its flow, and its own random numbers depend on that
+number. Lasting effects depend on the time since the flow's first packet, or, if they are common to
+all flows of a program (`netem.tunnel`), since the program's first packet.
 """
 
 from dataclasses import dataclass
@@ -35,9 +35,9 @@ class Fate:
     slot: int = 0
     """Slot in which the packet enters, counted from the start of its flow."""
     rank: int = 0
-    """Number of earlier packets of the flow, in the same slot or in all (`Fates.by_number`)."""
+    """Number of earlier packets of the flow in the same slot; with `by_number`, in all slots."""
     delay_ns: int = 0
-    """Delay [ns]; a lost packet has one, too."""
+    """Delay [ns]; a lost packet has a delay, too."""
     lost: bool = False
     """Whether the packet is lost."""
     copies: int = 0
@@ -73,7 +73,7 @@ class Stream:
 
         Args:
             place: slot or cell.
-            number: rank or number within it.
+            number: rank in the slot, or number within the cell.
         """
         if place == self._at and number == self._number:
             return self._pair
@@ -116,10 +116,11 @@ class Draws:
     def lasting(self, fate: Fate, mean_s: float) -> float:
         """Random number below 1 that is redrawn at the events of a Poisson process.
 
-        The number's distribution is uniform, and its autocorrelation falls exponentially. It
-        depends on the newest event only. To find that event, time is divided into cells of length
-        `mean_s`, and the events of one cell after another are drawn, backwards from the packet's
-        time. A cell has one event on average, and none with probability 1/e.
+        The number's distribution is uniform, and its autocorrelation falls exponentially. The
+        number depends only on the newest event before the packet. To find that event, time is
+        divided into cells of length `mean_s`, and the events of one cell after another are drawn,
+        backwards from the packet's time. A cell has one event on average, and none with probability
+        1/e.
 
         Args:
             fate: the packet.

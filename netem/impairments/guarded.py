@@ -18,7 +18,7 @@ def fate_of(fate: Fate, impairments: Iterable[tuple[Impairment, Draws]]) -> tupl
     """Fate of a packet after all impairments, and the traceback of the first error, or empty."""
     fault = ""
     for impairment, draws in impairments:
-        # Each impairment changes a copy: if it fails half-way, it must have no effect.
+        # Each impairment changes a copy, so that one which fails half-way has no effect.
         tried = replace(fate)
         try:
             impairment(tried, draws)
@@ -40,5 +40,5 @@ def _possible(fate: Fate) -> Fate:
         raise ValueError(f"got copies = {fate.copies}, expected 0 to {COPIES_MAX}")
     if fate.flipped is not None and not 0.0 <= fate.flipped < 1.0:
         raise ValueError(f"got flipped = {fate.flipped}, expected a share below 1")
-    # A plug-in may set a float; the heap of the link compares integers.
+    # A plug-in may set floats, but the link adds and compares integer nanoseconds.
     return replace(fate, delay_ns=int(fate.delay_ns), copies=int(fate.copies))

@@ -20,7 +20,7 @@ from skytether.netem.impairments.draws import Draws, Fate
 from skytether.shared.scenario.registry import IMPAIRMENTS
 
 impairment = IMPAIRMENTS
-"""Decorator for an impairment's class, whose arguments are given in the scenario."""
+"""Decorator that registers an impairment's class; the scenario gives the class its arguments."""
 
 Time = Annotated[float, Meta(ge=0, le=3600)]
 """Time from 0 to an hour [s]."""
@@ -29,8 +29,8 @@ Share = Annotated[float, Meta(ge=0, le=1)]
 
 
 class Impairment:
-    """Base class of an effect of the network on packets. An impairment must not store anything
-    between packets.
+    """Base class of an effect of the network on packets. An impairment must not store anything from
+    one packet to the next.
     """
 
     kind: Literal["delay", "loss", "other"] = "other"

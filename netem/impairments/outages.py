@@ -11,7 +11,7 @@ from skytether.shared.base.units import seconds_to_ns
 
 @impairment(name="gilbert_elliott")
 class GilbertElliott(Impairment):
-    """Loses packets while a channel is bad: a share of the time, in bursts of mean burst_s."""
+    """Loses packets while a channel is bad: this share of the time, on average for burst_s."""
 
     kind = "loss"
 
@@ -20,7 +20,7 @@ class GilbertElliott(Impairment):
     ) -> None:
         self._share, self._bad, self._good = share, loss_bad, loss_good
         self.loss = share * loss_bad + (1.0 - share) * loss_good
-        # A redrawn state is bad again with the probability `share`: so the mean burst is burst_s.
+        # A redrawn state is bad again with probability `share`, which makes bursts longer.
         self._cell_s = burst_s * (1.0 - share)
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
@@ -53,7 +53,7 @@ class Outage(Impairment):
 
 @impairment(name="outages")
 class Outages(Impairment):
-    """Loses all packets for random times of mean for_s, after random gaps of mean every_s."""
+    """Loses all packets for random times, for_s on average; gaps last every_s on average."""
 
     def __init__(self, every_s: Annotated[float, Meta(ge=0.001, le=3600)], for_s: Time) -> None:
         self.loss = for_s / (every_s + for_s)
@@ -66,12 +66,12 @@ class Outages(Impairment):
 
 @impairment(name="delivered")
 class Delivered(Impairment):
-    """Delivers a flow's packets within delay_s in periods, each flow, at_s, for_s, delay_s."""
+    """Delivers a flow's packets within delay_s; each period is flow, at_s, for_s, delay_s."""
 
     def __init__(self, *stretches: Annotated[float, Meta(ge=0, le=86400)]) -> None:
         each = list(zip(*(iter(stretches),) * 4, strict=False))
         if not each or len(stretches) % 4:
-            raise ValueError("four numbers a stretch: flow, at_s, for_s, delay_s at most")
+            raise ValueError("four numbers for each period: flow, at_s, for_s, largest delay_s")
         self._stretches = [
             (flow, round(at_s / SLOT_S), round((at_s + for_s) / SLOT_S), seconds_to_ns(most_s))
             for flow, at_s, for_s, most_s in each

@@ -35,8 +35,8 @@ class Queued(Impairment):
 
     is_queue = True
     times_s: Array | None = None
-    """Times at which DELIVERY_BYTES may leave the queue [s]; the last is also the period. None: at
-    any time."""
+    """Times at which DELIVERY_BYTES may leave the queue [s]; the last time is also the period.
+    None: packets leave at any time."""
     keeps_all = False
     """Whether nothing is dropped, because senders wait for space in the queue."""
 

@@ -1,8 +1,8 @@
 """Recorded networks: delays of a recorded path (`recorded`), and times at which packets are
 delivered.
 
-Delivery times are files in mahimahi's format: a line for each packet of 1504 bytes, with the
-millisecond of its delivery.
+Delivery times are read from files in mahimahi's format: each line is the millisecond at which a
+packet of 1504 bytes is delivered.
 """
 
 from functools import lru_cache
@@ -51,8 +51,8 @@ class Trace(Impairment):
         self.loss = float(recorded.lost.mean())
 
     def __call__(self, fate: Fate, draws: Draws) -> None:  # noqa: ARG002
-        """Apply the recording: a packet is lost if the packet sent at the nearest time in the
-        recording was lost.
+        """Apply the recording: a packet is lost if, in the recording, the packet sent nearest to
+        the same time was lost.
         """
         time_s = fate.time_s % self._loop_s if self._loop_s else fate.time_s
         fate.delay_ns += seconds_to_ns(interpolated(time_s, self._times_s, self._delays_s))

@@ -6,10 +6,10 @@
                      kernels (`possible_motions`, `compiled_motion`)
     led_vehicles     vehicles that follow this server, with a standby server or without
     waypoints        next target of a vehicle: its goal, or a point on its route (`routes`)
-    yielding         vehicles at rest move out of the way
+    yielding         vehicles at rest that have to move out of the way of others
     trajectory_qp    the QP for a new motion; its constraints: `half_planes`, `separation`,
                      `zone_clearance`
 
-The package registers nothing. It imports `shared.missions`, which has the keys and events, and
+The package registers no plug-ins. It imports `shared.missions`, which has the keys and events, and
 `server.planning`, but no other scheme and no trigger.
 """

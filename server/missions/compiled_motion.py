@@ -1,8 +1,8 @@
 """Functions of motions for kernels: state at a step, and bounds of speed and curvature.
 
-Because of downwash, vertical distances may count less than horizontal ones: coordinates are
-multiplied by `MotionMetric.scale` first. A sphere of scaled coordinates is an ellipsoid that is
-higher than wide.
+Because of downwash, vertical distances may have to be larger than horizontal ones. So coordinates
+are multiplied by `MotionMetric.scale` before distances are computed. A sphere in scaled coordinates
+is an ellipsoid that is higher than wide.
 """
 
 from typing import NamedTuple
@@ -26,7 +26,8 @@ class Extent(NamedTuple):
     speed: float
     """Largest speed, scaled [m/s]."""
     bend: float
-    """Largest distance of the motion from its chords, SAMPLES per interval, scaled [m]."""
+    """Largest distance of the motion from its chords, of which each interval between knots has
+    SAMPLES; scaled [m]."""
 
 
 def states(motion: Motion, begin: int, count: int, dt_s: float) -> tuple[Array, Array]:

@@ -58,7 +58,7 @@ def test_delivered_is_for_one_flow() -> None:
 
 @pytest.mark.parametrize("text", ["delivered()", "delivered(0, 1, 2)", "delivered(0, 1, 2, 3, 4)"])
 def test_delivered_needs_four_numbers_a_stretch(text: str) -> None:
-    with pytest.raises(GrammarError, match="four numbers a stretch"):
+    with pytest.raises(GrammarError, match="four numbers for each period"):
         impairments(text)
 
 
