@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.commandline.start import run
 
-if __name__ == "__main__":  # run first: the imports below are slow
+if __name__ == "__main__":  # before the slow imports below
     sys.exit(run("skytether.netem.__main__:emulate", "netem"))
 
 import gc
@@ -214,8 +214,8 @@ def _end_like(program: "Program") -> None:
         raise command.CommandError(program.fault or "the program was killed with its namespaces")
     if os.WIFSIGNALED(program.status):
         number = os.WTERMSIG(program.status)
-        system.dump_no_core()  # the program has written its own core
-        with suppress(OSError):  # the action of SIGKILL cannot change
+        system.dump_no_core()  # the program has written a core dump already
+        with suppress(OSError):  # the action of SIGKILL cannot be changed
             signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
     raise SystemExit(os.waitstatus_to_exitcode(program.status))

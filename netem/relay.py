@@ -44,7 +44,7 @@ class LosslessFates(Fates):
 
 
 class HalfConnection:
-    """One direction of a connection, before and within its link."""
+    """One direction of a connection: pieces held before its link, and its lane in the link."""
 
     def __init__(self, lane: Lane, link: Link) -> None:
         self.lane, self.link = lane, link

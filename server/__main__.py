@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.commandline.start import run
 
-if __name__ == "__main__":  # run first: the imports below are slow
+if __name__ == "__main__":  # before the slow imports below
     sys.exit(run("skytether.server.__main__:serve", "server"))
 
 import secrets

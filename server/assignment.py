@@ -46,7 +46,7 @@ class Decider(Protocol):
 
 
 class Assignment:
-    """Vehicles that a server plans for; each `session` is a `sessions.Session`."""
+    """Vehicles that a server plans for. Each `session` is of type `sessions.Session`."""
 
     def __init__(self, controller: Decider, limits: Any) -> None:
         self.controller, self.limits = controller, limits

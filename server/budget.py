@@ -12,8 +12,9 @@ The budget is a token bucket with b bytes: b ← b + r Δt, within ± r BURST_S,
 headers included. Urgent packets may make b negative. So a window of T seconds has at most r (T +
 BURST_S) bytes of packets that are not urgent. The rate r is `control.shared_bytes_per_s`.
 
-A refused vehicle asks again at the next step. The ranking covers all blocks of vehicles, with the
-latest request of each vehicle, at most one step old.
+A refused vehicle asks again at the next step. The server plans for vehicles in blocks, one after
+another. Each time the ranking covers the vehicles of all blocks, each with its latest request,
+which is at most one step old.
 """
 
 from collections.abc import Sequence

@@ -53,7 +53,7 @@ def _states(motion: Motion, begin: int, dt_s: float, position: F2, velocity: F2)
 
 @part
 def state_at(motion: Motion, axis: int, step: float, dt_s: float) -> tuple[float, float]:
-    """Position and velocity of a motion on an axis at a step; see `Motion.at`."""
+    """Position [m] and velocity [m/s] of a motion on an axis at a step; see `Motion.at`."""
     position, velocity = motion.position, motion.velocity
     along = (step - motion.first) / SPACING
     if along <= 0.0:
@@ -89,8 +89,7 @@ def bounding_box(motion: Motion, lands: bool, metric: MotionMetric, low: F1, hig
             high[x] = max(high[x], position[knot, x])
             if knot:
                 turn = max(turn, abs(velocity[knot, x] - velocity[knot - 1, x]))
-        # Between two knots, T apart, a parabola deviates from the straight line by at most Δv T /
-        # 8.
+        # Between knots, T apart, a parabola deviates from the straight line by at most Δv T / 8.
         bend = turn * SPACING * metric.dt_s / 8.0
         low[x], high[x] = scale[x] * (low[x] - bend), scale[x] * (high[x] + bend)
         if x == ALTITUDE and lands:
