@@ -144,7 +144,7 @@ def emulate(argv: Sequence[str]) -> None:
 
 
 def emulate_for(argv: Sequence[str]) -> None:
-    """Run a program whose only network is netem, with the program's exit code and streams.
+    """Run a program whose only network is netem; exit code and streams are the program's.
 
         skytether netem run --to-program "constant(50ms)"
             --from-program "constant(50ms) & loss(5%)" --seed 7

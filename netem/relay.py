@@ -202,7 +202,7 @@ def _only_packets(of: Impairments) -> list[str]:
 
 
 def _for_streams(of: Impairments) -> Impairments:
-    """Impairments for pieces of byte streams: pieces stay in order, and the queue drops none."""
+    """Impairments for pieces of byte streams: pieces stay in order, and a queue drops none."""
     same = copy(of)
     same.is_ordered = True
     if same.queue:
