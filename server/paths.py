@@ -168,7 +168,7 @@ class ServerPaths:
         return [*chain.from_iterable(self._to(path, datagram, now_ns) for path in on)]
 
     def _to(self, path: int, datagram: bytes, now_ns: int) -> list[Datagram]:
-        """Datagrams to a path's newest address, and to the former one if it still sends."""
+        """Datagrams to a path's newest address, and to the former one if packets come from it."""
         places = self._places[path]
         newest = next(reversed(places))
         return [
@@ -183,7 +183,7 @@ class ServerPaths:
 
 
 class RoutesOverPaths(Routes):
-    """Routes to vehicles, some of which have several paths.
+    """Routes to vehicles with one or several paths.
 
     Args:
         entropy: returns this many random bytes.
@@ -300,7 +300,7 @@ class RoutesOverPaths(Routes):
         return {"paths": paths.paths.figures(now_ns)} if paths else {}
 
     def _note(self, session: Session, paths: ServerPaths) -> None:
-        """Note the paths of a session and their proven addresses, in place of earlier ones."""
+        """Note the paths of a session and their proven addresses; they replace earlier paths."""
         self.forget(session)
         session.route = paths
         self.of[session.vehicle] = session
@@ -319,7 +319,7 @@ def _paths(session: Session) -> ServerPaths | None:
 def _hear(
     paths: ServerPaths, report: Report, datagram: Datagram, now_ns: int, *, is_recent: bool = True
 ) -> int | None:
-    """Note a message's loss report; returns the message's path, None without a proven address."""
+    """Note a message's loss report; return the message's path, or None without a proven address."""
     path = paths.hear(Place(datagram.peer, datagram.socket), now_ns)
     paths.paths.heard(report, datagram.payload, path, now_ns, is_recent=is_recent)
     return path

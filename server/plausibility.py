@@ -1,6 +1,6 @@
 """Plausibility check of observations: rejects well-formed observations with impossible values.
 
-Each is compared with the vehicle's last accepted observation:
+Each observation is compared with the vehicle's last accepted observation:
 
     clock     with the delay of the other direction, its delay must give a round trip of at least 0
     horizon   the horizon in force, and its first flown step, must not go back nor lie in the future

@@ -246,7 +246,7 @@ class Reception:
             hello.vehicle, number, hello.boot_id, self._boot_id, now_ns, refusal, self._terms
         )
         self._answer(welcome, call, datagram)
-        # After sealing the answer, because sealing creates the channel.
+        # The channel is kept only now, because sealing the answer has created it.
         if refusal is Refusal.ACCEPTED:
             self._gate.admit(call, now_ns=now_ns)
 
@@ -293,7 +293,7 @@ class Reception:
         if verdict == ANEW:
             self._anew(row, None)
             session.hearing.begin()
-        # After the plausibility check, which may discard the newest observation as wrong.
+        # Checked after the plausibility, whose check may discard the newest observation as wrong.
         self._refuse_overtaken(session, observation.step)
         session.doubted = False
         if report:
@@ -316,7 +316,7 @@ class Reception:
             self._sessions.stale[session.row] += 1
             return
         # Only the packet with the highest counter may change the address: once the original has
-        # arrived, a copy from elsewhere cannot.
+        # arrived, a copy from elsewhere cannot change it.
         if call.moves:
             session.move(datagram.peer, call.line, now_ns, datagram.socket)
             if not report:
@@ -344,7 +344,7 @@ class Reception:
             self._answer(question, call, datagram)
 
     def _hear_time(self, session: Session, message: Time, now_ns: int) -> None:
-        """Narrow a clock offset's bounds by the vehicle's time of day, if this host has one too."""
+        """Narrow a clock offset's bounds by the vehicle's time of day, if this host knows it too."""
         error_ns = self.time and self.time.error_at(now_ns)
         if error_ns is None or self.time is None:
             return

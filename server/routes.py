@@ -1,6 +1,6 @@
 """Routes to vehicles that have one address each, stored in their sessions.
 
-`server.paths` replaces them if a vehicle has several paths.
+`server.paths` replaces these routes if a vehicle has several paths.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,7 +32,7 @@ class Routes:
     """Routes to all vehicles of a server; each `session` is a `sessions.Session`."""
 
     def of_several(self, entropy: Callable[[int], bytes], spread: str, timeout_ns: int) -> "Routes":
-        """Routes to vehicles, some of which have several paths.
+        """Routes to vehicles with one or several paths, which replace these routes.
 
         Args:
             entropy: returns this many random bytes.
@@ -87,7 +87,7 @@ class Routes:
         """Forget a session that has ended."""
 
     def appraise(self, decisions: Any) -> None:
-        """Note the decisions for vehicles, before their plans are sent."""
+        """Note the trigger's decisions and the costs of not sending, before plans are sent."""
 
     def watch(
         self, put: Callable[[int, Sequence[Datagram]], None], events: Events, now_ns: int

@@ -35,9 +35,9 @@ from skytether.shared.wire.noise_nnpsk0 import KEY_BYTES, NoiseError, Responder
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, Hello
 
 COOKIE_NS = 60 * SECOND_NS
-"""Length of a cookie's period; each cookie is valid in its period and the next one [ns]."""
+"""Length of a cookie's period; each cookie is valid in its period and the next period [ns]."""
 HANDSHAKES = 5
-"""Largest number of a vehicle's handshake attempts per second, and of answers to repeated ones."""
+"""Largest number per second of a vehicle's handshake attempts, and of answers to repeats."""
 PENDING_MAX = 64
 """Largest number of pending channels of a vehicle; the vehicle uses the first RESPONSE to arrive.
 Even if an attacker replays the vehicle's HELLOs, five per second, round trips up to 12 s stay
@@ -45,7 +45,7 @@ within this limit."""
 COMPLETED_MAX = 16
 """Number of stored completed attempts of a vehicle; repeats of them are not answered."""
 OUT_MAX = 1024
-"""Largest number of the gate's answers waiting to be sent; older ones are dropped."""
+"""Largest number of the gate's answers waiting to be sent; older answers are dropped."""
 
 
 class _Pending(NamedTuple):
@@ -122,7 +122,7 @@ class _KeyedVehicle:
             del self.pending[next(iter(self.pending))]
 
     def promote(self, number: int, now_ns: int) -> None:
-        """Make a pending channel the live one, and drop the channels pending before it."""
+        """Make a pending channel the live channel, and drop the channels pending before it."""
         channel, public, _ = self.pending[number]
         self.completed.append(public)
         for older in list(self.pending):
@@ -214,7 +214,7 @@ class SecureGate:
     def number(self, vehicle: int) -> int:
         """Unpredictable number for a new channel of a vehicle."""
         keyed = self._vehicles[vehicle]
-        # Drawn again if a channel of the vehicle already has this number: one case in 2^32.
+        # The number is drawn again if a channel of the vehicle already has it: one case in 2^32.
         while True:
             (number,) = CHANNEL.unpack(self.entropy(CHANNEL.size))
             if keyed.find(number) is None:
@@ -259,7 +259,8 @@ class SecureGate:
         if public in keyed.completed:  # the vehicle has completed this handshake attempt
             raise ProtocolError(Drop.REPLAYED)
         response = keyed.response(public)
-        # Anybody who eavesdrops can repeat an attempt, but a new one needs the key: two limits.
+        # Anybody who eavesdrops can repeat an attempt, but only a vehicle with the key can make a
+        # new one. So repeats and new attempts have separate limits.
         if response is None:
             if not keyed.attempts.grant(now_ns):
                 raise ProtocolError(Drop.TOO_MANY_HANDSHAKES)

@@ -55,9 +55,9 @@ class Session:
     row: int = -1
     """Row of the vehicle in every array; -1 until its first observation."""
     heard_ns: int = 0
-    """Time of the newest packet from the vehicle."""
+    """Time of the newest packet from the vehicle [ns]."""
     sent_ns: int = 0
-    """Time of the newest packet to the vehicle."""
+    """Time of the newest packet to the vehicle [ns]."""
     doubted: bool = False
     """Whether the newest observation was rejected."""
     unsaved: bool = False
@@ -88,8 +88,8 @@ class Session:
         return 0 < self.asked_ns <= now_ns - self.sent_ns
 
     def sealed(self, payload: bytes, now_ns: int) -> Sequence[Datagram]:
-        """Datagrams that carry a message to the vehicle: one, or copies for several addresses or
-        paths.
+        """Datagrams that carry a message to the vehicle: one datagram, or copies for several
+        addresses or paths.
 
         The vehicle's address may have changed since its HELLO, or an attacker's copies of its
         packets may arrive first. So packets also go to the address of the HELLO, and to the address
@@ -139,7 +139,7 @@ class Sessions:
         self._live: dict[int, Session] = {}
         """Live sessions, by number of the vehicle."""
         self.welcomed_vehicles: OrderedDict[int, Session] = OrderedDict()
-        """Welcomed vehicles without a row, oldest HELLO first; at most one for each free row."""
+        """Welcomed vehicles without a row, oldest HELLO first; at most as many as free rows."""
         self._successors: dict[int, Session] = {}
         """Sessions of new client runs of vehicles with a row, until their first observation."""
         self._by_row: dict[int, Session] = {}
@@ -153,7 +153,7 @@ class Sessions:
         self.vehicle = np.zeros(capacity, dtype=np.int64)
         """Number of the vehicle in each row; shape (capacity,)."""
         self.stale = np.zeros(capacity, dtype=np.int64)
-        """Number of observations of each session that arrived after a newer one; shape
+        """Number of observations of each session that arrived after a newer observation; shape
         (capacity,)."""
         self.routes = Routes()
         """Routes to the vehicles; replaced once a vehicle has several paths."""
@@ -183,8 +183,8 @@ class Sessions:
     def holder(self, hello: Hello, now_ns: int) -> Session | None:
         """Session of another run with the vehicle's number, because of which this HELLO is refused.
 
-        This is the live session while its packets arrive; otherwise a welcomed session whose first
-        observation may still arrive.
+        It is the live session while packets of this session arrive; otherwise a welcomed session
+        whose first observation may still arrive.
         """
         live = self._live.get(hello.vehicle)
         if live is not None and live.boot_id == hello.boot_id:
@@ -263,7 +263,7 @@ class Sessions:
         return session if session and session.number == message.session else None
 
     def begin(self, observation: Observation, now_ns: int) -> Session:
-        """Make the welcomed session of a first observation the live one, and return it.
+        """Make the welcomed session of a first observation the live session, and return it.
 
         Raises:
             ProtocolError: there is no such session, or an earlier run of the client is active.
@@ -273,7 +273,7 @@ class Sessions:
         session = waiting.get(observation.vehicle)
         if session is None or session.number != observation.session:
             raise ProtocolError(Drop.UNKNOWN_SESSION)
-        # Checked again: the earlier run may have returned since the WELCOME.
+        # This is checked again, because the earlier run may have returned since the WELCOME.
         if before is not None and self._is_heard(before, now_ns):
             raise ProtocolError(Drop.TAKEN)
         del waiting[session.vehicle]
@@ -292,7 +292,7 @@ class Sessions:
         return session
 
     def expire(self, now_ns: int) -> list[Session]:
-        """End the sessions of silent vehicles, and return them."""
+        """End the sessions of silent vehicles, and return these sessions."""
         gone = [each for each in self if now_ns - each.heard_ns > SESSION_NS]
         for session in gone:
             self.end(session)
@@ -305,7 +305,7 @@ class Sessions:
             self._reserved[session.vehicle] = session.row
         else:
             heappush(self._free_rows, session.row)
-            # The row goes to a new run that was waiting for the silence of the old one.
+            # The row goes to a new run of the client that was waiting until the earlier run ended.
             successor = self._successors.pop(session.vehicle, None)
             if successor is not None:
                 self.welcomed_vehicles[session.vehicle] = successor

@@ -1,5 +1,5 @@
 """Leaders of vehicles that have two servers: each vehicle's reports of its leader (LEAD), and the
-number of the leadership in every plan, see docs/together-proof.md.
+leadership number in every plan, see docs/together-proof.md.
 
 `AssignmentOfTwo` replaces `server.assignment.Assignment` at the first LEAD (`server.reception`); a
 server in real time loads this module before its first packet.
@@ -24,7 +24,7 @@ class SessionLead(NamedTuple):
     """A vehicle's reports of its leader in a session."""
 
     lead: Lead
-    """The vehicle's LEAD with the largest number of a leadership so far."""
+    """The vehicle's LEAD with the largest leadership number so far."""
     step: int
     """Step in the vehicle's newest LEAD."""
 
@@ -36,7 +36,7 @@ class AssignmentOfTwo(Assignment):
         super().__init__(plain.controller, plain.limits)
         self.changes, self.changed_ns = plain.changes, plain.changed_ns
         self._largest = 0
-        """Largest number of a leadership that a vehicle has reported."""
+        """Largest leadership number that a vehicle has reported."""
 
     def of_several(self) -> Assignment:
         return self
@@ -46,7 +46,7 @@ class AssignmentOfTwo(Assignment):
         self._note(session.row, said.lead if said else None)
 
     def take(self, session: Any, message: Message) -> Message:
-        """Note which server leads a vehicle; repeats of the same number are ignored."""
+        """Note which server leads a vehicle; repeats of a leadership number are ignored."""
         assert isinstance(message, Lead)
         said: SessionLead | None = session.lead
         if said is None or message.number > said.lead.number:
@@ -61,8 +61,8 @@ class AssignmentOfTwo(Assignment):
         return with_leadership(said.lead.number, plan) if said else plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterator[Datagram]:
-        """Send the largest number of the leadership to vehicles that follow a smaller number, and,
-        for a while after a change, the limits to all vehicles.
+        """Send the largest leadership number to vehicles that follow a smaller number, and for a
+        while after a change of the motions' limits these limits to all vehicles.
         """
         is_changed = self.changed_ns is not None and now_ns < self.changed_ns + LIMITS_NS
         for session in sessions:
@@ -71,7 +71,7 @@ class AssignmentOfTwo(Assignment):
                 yield from session.sealed(encode(self._answer(session)), now_ns)
 
     def _note(self, row: int, lead: Lead | None) -> None:
-        """Note a vehicle's LEAD; None if the vehicle has only this server.
+        """Note a vehicle's LEAD; `lead` is None if the vehicle has only this server.
 
         A server that takes over from another sends two plans: the vehicle may be about to brake,
         and a plan may be lost. Vehicles of a mission hold their position instead.
@@ -84,14 +84,14 @@ class AssignmentOfTwo(Assignment):
         )
 
     def _number(self, said: SessionLead) -> int:
-        """Number of the leadership that a vehicle should follow: the largest, if all follow one
-        server.
+        """Leadership number that a vehicle should follow: the largest, if all vehicles have to
+        follow one server.
         """
         return self._largest if self.limits else said.lead.number
 
     def _answer(self, session: Any) -> Lead:
-        """LEAD with the vehicle's number, the largest number that it should follow, and the limits
-        of the server's motions.
+        """LEAD with the vehicle's leadership number, the leadership number that the vehicle should
+        follow, and the limits of the server's motions.
         """
         said: SessionLead = session.lead
         return Lead(

@@ -133,7 +133,7 @@ class Ticker:
         if events := controller.scheme.events:
             self._events += events
             events.clear()
-        # Last, because a horizon sent at this tick replaces a heartbeat.
+        # Heartbeats come last, because a plan sent at this tick replaces a heartbeat.
         if heartbeats:
             self._send_heartbeats(heartbeats, now_ns)
         self._sessions.routes.watch(self._put, self._events, now_ns)
@@ -151,7 +151,7 @@ class Ticker:
                 self._events.append(PlanningStopped(vehicle=vehicle, why=str(why)))
 
     def _send_plans(self, decisions: Decisions, now_ns: int) -> None:
-        # The time of sending, not of the tick: with this stamp the vehicle measures the delay.
+        # The stamp has the time of sending, not of the tick: the vehicle measures delays with it.
         batch, sessions, sent_us = decisions.batch, self._sessions, stamp_us(now_ns)
         sessions.routes.appraise(decisions)
 

@@ -40,7 +40,7 @@ class HalfPlanes(NamedTuple):
     """Index of the motion to keep away from; shape (n,)."""
 
     def from_some(self, chosen: Flags) -> "HalfPlanes":
-        """Half-planes of some motions; `chosen`: flags of these motions, shape (motions,)."""
+        """Half-planes of the motions whose flag in `chosen` is True; `chosen`: shape (motions,)."""
         selected = chosen[self.other]
         return HalfPlanes._make(each[selected] for each in self)
 
@@ -55,19 +55,19 @@ def half_planes(
     distance_m: float,
     error: StepError = EXACT,
 ) -> HalfPlanes:
-    """Half-planes normal to the lines from the others' motions to the motion in force.
+    """Half-planes normal to the lines from other vehicles' motions to the motion in force.
 
     If the step of another vehicle is not known exactly, the line starts at its nearest possible
     position, and all its possible positions lie behind the plane.
 
     Args:
-        times: common steps; shape (n,).
+        times: sampled steps of the common time grid; shape (n,).
         in_force: positions of the motion in force at these steps [m]; shape (n, axes).
         reach_m: largest distance of the plan from these positions [m]; shape (n,).
         row: row of the vehicle; its own motions are ignored.
         lands: first step at which the vehicle may begin to land, or NEVER.
         possible: motions of all vehicles.
-        distance_m: distance to keep [m]; less if the motion in force is nearer already.
+        distance_m: distance to keep [m]; reduced where the motion in force is already nearer.
         error: error of the vehicle's step number by the server's count.
     """
     capacity = len(times) * possible.count
@@ -113,7 +113,7 @@ def _half_planes(
         other = motion_at(others, m)
         least, capacity = shifts(error, other.error, drift)
         for i in range(len(times)):
-            # At the last time all vehicles are at rest, and those that may land have landed.
+            # At the last sampled time all vehicles rest, and vehicles that may land have landed.
             descends = times[i] >= lands or (i == final and lands < NEVER)
             other_descends = times[i] + capacity >= other.lands or (
                 i == final and other.lands < NEVER
@@ -122,7 +122,7 @@ def _half_planes(
             away = _offset_from_way(
                 in_force[i], way[:corners], descends, other_descends, scale, off, scratch
             )
-            # No constraint if the vehicles are out of reach of each other, or at the same position,
+            # No constraint if the vehicles cannot come near each other, or at the same position,
             # so that the plane has no direction.
             if away >= keep + reach[i] or away == 0.0:
                 continue
@@ -142,7 +142,7 @@ def _half_planes(
 def _possible_way(
     other: Motion, step: float, least: float, most: float, dt_s: float, way: F2
 ) -> int:
-    """Fill in a polyline of another vehicle's possible positions [m]; return its corner count."""
+    """Fill in a polyline of another vehicle's possible positions [m]; return the corner count."""
     first, last = moving_shifts(other, step, step, least, most)
     slices = int(np.ceil((last - first) * SAMPLES / SPACING))
     for j in range(slices + 1):
@@ -161,8 +161,8 @@ def _offset_from_way(
     Args:
         place: the point; shape (axes,).
         way: corners of the polyline; shape (n, axes).
-        descends, other_descends: whether the vehicle at the point, and the one on the polyline, may
-            be landing.
+        descends, other_descends: whether the vehicle at the point, and the vehicle on the polyline,
+            may be landing.
         off: output: vector from the nearest point to `place`, scaled [m]; shape (axes,).
     """
     nearest = np.inf

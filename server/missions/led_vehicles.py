@@ -14,10 +14,10 @@ class LedVehicles:
         """Leadership number with which each row's vehicle follows this server; None if the vehicle
         follows another server."""
         self._alone: set[int] = set()
-        """Rows of vehicles that have no other server."""
+        """Rows of vehicles that have only this server, without a standby server."""
         self._awaited: dict[int, int] = {}
-        """Rows of vehicles that this server has begun to lead but has not observed since, with the
-        first step of observations that count."""
+        """First step whose observation ends the wait, by the row of each vehicle that this server
+        has begun to lead but has not observed since."""
         self.missing: int | None = None
         """Row of a vehicle that keeps the server from planning motions; None if there is none."""
 
@@ -59,6 +59,6 @@ class LedVehicles:
         missing = (
             row for row, number in self._numbers.items() if number != newest or row in self._awaited
         )
-        # If a vehicle has only this server, no other server ever observes all vehicles, so none
-        # plans: all vehicles fly this server's motions, or hold their positions.
+        # If a vehicle has only this server, no other server ever observes all vehicles, and so no
+        # other server plans. All vehicles fly this server's motions, or hold their positions.
         self.missing = None if self._alone else next(missing, None)

@@ -68,7 +68,8 @@ ARRIVED_M = 0.02
 ROUNDS = 5
 """Largest number of QPs per waypoint, each with further constraints."""
 STUCK = 0.3
-"""Share of the distance to its waypoint (2 m at most) that a plan must cover; else it is stuck."""
+"""Share of the distance to the waypoint, of 2 m at most, that a plan must cover; if a plan covers
+less, the vehicle counts as stuck."""
 TURN = 2.0 * np.pi * np.arange(32) / 32
 AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 """Directions in which a vehicle at rest within a zone searches for a way out."""
@@ -78,7 +79,8 @@ NEARER_M = 1e-3
 """Distance by which a vehicle that leaves a zone may approach it: a tolerance [m]."""
 ZONE = "a zone"
 CLOCK_POINTS = 33
-"""Number of possible steps of a vehicle at which `clock_m` is evaluated."""
+"""Number of steps, within the error of a vehicle's step number, at which `_clock_m` evaluates its
+motion."""
 BINDS_M = 1e-4
 """Distance of a motion from a half-plane within which the half-plane counts as limiting it [m]."""
 
@@ -207,7 +209,7 @@ class MissionPlanner(SplineScheme):
             self._zones, self.limits = zones(scenario), limits(scenario)
             self._waypoints.change_zones(self._zones)
             for vehicle in self._state.vehicles.values():
-                vehicle.goal = None  # resets closed positions and progress, made with the old zones
+                vehicle.goal = None  # resets closed positions and progress: they fit the old zones
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
         """See `Scheme`; refuses a zone in the way of a vehicle."""
@@ -266,7 +268,7 @@ class MissionPlanner(SplineScheme):
     def _clock_m(self, row: int) -> float | None:
         """Largest shift of a vehicle along its motion by its clock error [m]; None if unknown.
 
-        Other vehicles keep this additional distance along its path.
+        Other vehicles keep this additional distance along the vehicle's path.
         """
         vehicle, error = self._state.vehicles.get(row), self._state.error(row)
         if vehicle is None or vehicle.in_force is None:
@@ -280,8 +282,8 @@ class MissionPlanner(SplineScheme):
     # -- decisions ---------------------------------------------------------------------------------
 
     def _may_plan(self, row: int, vehicle: VehicleMotions, k: int) -> bool:
-        """Whether a motion may be planned at step k; if not, sets `waits_for`, or has the motion in
-        force sent again.
+        """Whether a motion may be planned at step k. If not, `waits_for` is set to the reason, or
+        the motion in force is sent again.
         """
         in_force = vehicle.in_force
         assert in_force is not None
@@ -297,7 +299,7 @@ class MissionPlanner(SplineScheme):
         return not vehicle.waits_for
 
     def _own_wait(self, row: int, vehicle: VehicleMotions) -> str:
-        """Reason why no motion may be sent to this vehicle yet, in words; empty if one may be."""
+        """Reason why this vehicle may not get a motion yet, in words; empty if it may."""
         if self._leaves:
             return "another server: this one ends"
         if row in self._state.restarted:
@@ -389,13 +391,13 @@ class MissionPlanner(SplineScheme):
         return np.concatenate([place[None], self._waypoints.routes.way(place, goal)])
 
     def _has_to_pass(self, yields: Yielding, home: Array) -> bool:
-        """Whether the vehicle that asked still has to pass the goal of the yielding vehicle."""
+        """Whether the vehicle that asked another to yield still has to pass the other's goal."""
         path = self._way(yields.asker, self._state.goal(yields.asker)) * self._scale
         (away_m,) = yielding.distance_from_way(home[None] * self._scale, path)
         return bool(away_m < self._clearances.planned_apart_m)
 
     def _ask_to_yield(self, row: int, way: Array) -> bool:
-        """Let the first vehicle at rest at its goal on the path `way` yield; False if none can."""
+        """Make the first vehicle that rests at its goal on a path yield; False if none can."""
         keep_m = self._clearances.planned_apart_m
         rest_ends, homes = list[tuple[int, Array]](), list[int]()
         for other, each in self._state.vehicles.items():
@@ -461,7 +463,7 @@ class MissionPlanner(SplineScheme):
                     break
                 violated |= conflicts
                 planes = planes or self._half_planes(row, base, due)
-            # A plan that hardly moves counts as stuck, and another waypoint is tried.
+            # If the plan hardly moves the vehicle, another waypoint is tried.
             moved_m, far_m = math.dist(motion.position[-1], p0), math.dist(targets[-1], p0)
             if moved_m >= STUCK * min(far_m, 2.0) and not conflicts.any():
                 vehicle.waits_for, vehicle.turned_rad = "", max(0.0, vehicle.turned_rad - TURN_BACK)

@@ -1,8 +1,8 @@
 """Mission state: the motions that each vehicle may fly, as far as the server knows.
 
-Observations, which acknowledge motions, and each motion sent update this state; `mission_planner`
-plans with it. Here the steps of all vehicles are mapped to one common time grid, so that motions
-can be compared.
+The state is updated by observations, which acknowledge motions, and by each motion sent;
+`mission_planner` plans with the state. Here the steps of all vehicles are mapped to one common time
+grid, so that motions can be compared.
 """
 
 from collections import Counter
@@ -61,9 +61,10 @@ class VehicleRows(NamedTuple):
     repeats_for: I1
     """Number of steps for which the latest motion is repeated, see `VehicleMotions.repeats`."""
     early: F1
-    """Largest number of steps that the vehicle may be ahead of `now + ahead`, see `StepError`."""
+    """Largest number of steps by which the vehicle may be ahead of its step `now + ahead` by the
+    server's count, see `StepError`."""
     late: F1
-    """Largest number of steps that the vehicle may be behind `now + ahead`."""
+    """Largest number of steps by which the vehicle may be behind its step by the server's count."""
 
     @classmethod
     def of(cls, capacity: int) -> Self:
@@ -120,7 +121,7 @@ class MissionState:
         )
         self._dead_time_s = terms.dead_time_s
         self.kept_steps = -(-terms.join // SPACING) * SPACING
-        """Number of steps from the first knot for which a new motion equals the one in force."""
+        """Number of steps from the first knot for which a new motion equals the motion in force."""
         self._land_after = terms.land_after if lands(scenario) else NEVER
         """Number of steps without packets after which a hovering vehicle lands."""
         self._tau_s, self._braking = max(terms.tau_s), 2.0 * terms.brake_mps2
@@ -152,7 +153,7 @@ class MissionState:
         self.led_vehicles = LedVehicles()
 
     def forget(self, row: int) -> None:
-        """End a session; its motions are kept, because the vehicle continues on them."""
+        """End a vehicle's session, but keep its motions, because the vehicle still flies them."""
         self.observed_step[row] = -1
         self.rows.heard[row] = False
         if row in self.vehicles:
@@ -205,7 +206,7 @@ class MissionState:
         return k > self.rows.unknown_until[row] and all(last <= k for last in ends)
 
     def brakes_m(self, vehicle: VehicleMotions) -> float:
-        """Braking distance from the observed position, without a motion [m]; 0 with a motion."""
+        """Distance in which a vehicle without a motion will stop [m]; 0 if it has a motion."""
         brakes = vehicle.in_force is not None and vehicle.in_force.step < 0
         return self._stopping_m(vehicle) if brakes else 0.0
 
@@ -235,7 +236,8 @@ class MissionState:
     def unknown(self) -> int | None:
         """Number of a vehicle whose possible positions are unknown; None if there is none.
 
-        Either a restarted server has not observed it, or it flies a motion of another server.
+        Either the server has not observed the vehicle since the server started, or the vehicle
+        flies a motion of another server.
         """
         unheard = self.absent.difference(self.rows.number[list(self.vehicles)].tolist())
         if unheard:
@@ -247,7 +249,7 @@ class MissionState:
         return place
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """Process an observation; False if it is not newer than the last."""
+        """Process an observation; return False if the observation is not newer than the last."""
         if observation.step <= self.observed_step[row]:
             return False
         k = observation.step
@@ -260,7 +262,7 @@ class MissionState:
         self.rows.number[row] = self.number_of(row)
         self._watch(row, vehicle, observation)
         if observation.in_force == NO_HORIZON:
-            # The vehicle hovers, or brakes to hover: it has accepted no motion, or has ended all.
+            # The vehicle hovers, or brakes: it has not accepted a motion, or has ended all motions.
             vehicle.in_force = SentMotion(-1, resting(k, self._place(row, observation.state[:, 0])))
             vehicle.is_foreign = False
             # The vehicle will not accept motions of an earlier session, either.
@@ -280,8 +282,8 @@ class MissionState:
         if flies_on:
             self.foreign = row
         if flies_on or vehicle.is_foreign:
-            # Also once after the end of another server's motion: the vehicle then rests at that
-            # end, not at a position observed earlier.
+            # This is also done once after another server's motion has ended: the vehicle then rests
+            # at the end of that motion, not at a position observed earlier.
             vehicle.in_force = SentMotion(
                 vehicle.in_force.step, resting(k, observation.state[:, 0])
             )
@@ -327,7 +329,7 @@ class MissionState:
         if self._land_after == NEVER:
             return
         match observation.mode:
-            # Not at the first observation: the client may have counted other steps before it.
+            # At the first observation `lands` is no bound: an earlier run counted other steps.
             case Mode.HOVER if lands[row] < NEVER and self.rows.heard[row]:
                 # The vehicle may land from now on, but not before the step computed earlier.
                 lands[row] = max(lands[row], k)
@@ -366,15 +368,15 @@ class MissionState:
         return first if np.linalg.norm(first - observed) < self._tube_m else observed
 
     def align(self, rows: Indices, step: Indices) -> None:
-        """Map steps of all vehicles to the common time grid, and discard unsent decisions."""
+        """Map steps of all vehicles to the common time grid, and discard motions not yet sent."""
         n, self._is_updated = len(rows), False
         self.now = self._clock.tick_ns // self._dt_ns
         moved, foreign = _align(rows, step, self.now, self.rows, self.due, self._moved_by)
-        # All rows, because other vehicles avoid silent ones too.
+        # All rows, because vehicles also avoid a vehicle whose packets do not arrive.
         counted = self.now + self.rows.ahead
         self._clock.step_errors(self._all, counted, self.rows.early, self.rows.late)
         for row, since in self.restarted.items():
-            # With a restarted client the vehicle may have stopped anywhere on its motion.
+            # When its client restarted, the vehicle may have stopped anywhere on its motion.
             stands = float(LONGEST + counted[row] - since)
             self.rows.late[row] = max(self.rows.late[row], stands)
         if moved:
@@ -400,8 +402,8 @@ class MissionState:
         self.possible.set_errors(self.rows.early, self.rows.late)
 
     def goal(self, row: int) -> Array:
-        """Present goal of a vehicle [m]; shape (axes,). In a show, the point of the vehicle's path
-        at the end time of a motion planned now.
+        """Present goal of a vehicle [m]; shape (axes,). In a show it is the point of the vehicle's
+        path at the time when a motion planned now would end.
         """
         steps = self.kept_steps + INTERVALS * SPACING if self.is_show else 0
         return self._desired(row, np.array((self.now + self.ahead(row) + steps) * self._dt_s))

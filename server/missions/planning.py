@@ -16,10 +16,10 @@ from skytether.shared.scenario.schema import Scenario
 def references(
     scenario: Scenario, given: Callable[[int], Reference] | None, most: int
 ) -> Callable[[int], Reference]:
-    """References of vehicles, by number, whose goals may be replaced in flight.
+    """Function from a vehicle's number to its reference, whose goals may be replaced in flight.
 
     Args:
-        given: references without these goals; None: the scenario's.
+        given: references without the scenario's goals; None: the scenario's references.
         most: largest number of vehicles.
     """
     goals = parse_goals(scenario.section(MissionConfig).goals, scenario.model.axes)

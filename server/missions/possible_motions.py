@@ -1,10 +1,10 @@
 """Possible motions of all vehicles in arrays, with their uncertainty.
 
 The server knows the position of each vehicle on its motion up to the error of the vehicle's step
-number by the server's count (`planning.clock.StepError`). For two vehicles only the sum of both
+number by the server's count (`planning.clock.StepError`). For two vehicles only the sum of their
 errors matters: the number of steps by which the second may be ahead or behind. So the first vehicle
-is assumed to be at its step by the server's count, and the second anywhere between two steps: on a
-piece of its path that is longer at a higher speed, and a point at rest.
+is assumed to be at its step by the server's count, and the second anywhere between two steps, on a
+piece of its path. The piece is longer at a higher speed, and a single point at rest.
 
 In three dimensions a vehicle without contact lands after a while. From the first possible step of
 the landing on, the vehicle may be anywhere between the end of its motion and the ground. So in the
@@ -45,9 +45,10 @@ class MotionArrays(NamedTuple):
     extra: F1
     """Additional distance to keep from the motion [m]."""
     early: F1
-    """Largest number of steps by which the vehicle is ahead, see `planning.clock.StepError`."""
+    """Largest number of steps by which the vehicle may be ahead of the server's estimate, see
+    `planning.clock.StepError`."""
     late: F1
-    """Largest number of steps by which the vehicle is behind the server's estimate."""
+    """Largest number of steps by which the vehicle may be behind the server's estimate."""
     position: F3
     """Positions of the knots [m]; shape (capacity, KNOTS, axes)."""
     velocity: F3
@@ -75,7 +76,7 @@ class PossibleMotions:
             self.add(row, motion, extra_m)
 
     def add(self, row: int, motion: PossibleMotion, extra_m: float = 0.0) -> None:
-        """Add a motion, from which others keep a distance larger by `extra_m` [m]."""
+        """Add a motion; other vehicles keep the additional distance `extra_m` [m] from it."""
         if self.count == len(self.arrays.row):
             self.arrays = MotionArrays._make(
                 np.concatenate([each, np.zeros_like(each)]) for each in self.arrays
@@ -84,7 +85,7 @@ class PossibleMotions:
         self.count += 1
 
     def set_errors(self, early: Array, late: Array) -> None:
-        """Replace the errors of all vehicles' steps, given by row; shape (capacity,)."""
+        """Set the errors of all vehicles' step numbers, by row [steps]; shape (capacity,)."""
         n, rows = self.count, self.rows
         self.arrays.early[:n], self.arrays.late[:n] = early[rows], late[rows]
 
@@ -139,7 +140,7 @@ def _add(
 
 @making_kernel
 def _remove(arrays: MotionArrays, count: int, row: int, metric: MotionMetric) -> int:
-    """Remove a vehicle's motions, move the last motions into the gaps, return the number left."""
+    """Remove a vehicle's motions, fill the gaps with the last motions; return the number left."""
     for m in range(count - 1, -1, -1):
         if arrays.row[m] == row:
             count -= 1
@@ -160,7 +161,7 @@ def is_beyond(arrays: MotionArrays, m: int, low: F1, high: F1, distance: float) 
 
 @part
 def height_above(height: float, one_lands: bool, other_lands: bool) -> float:
-    """Height difference of two vehicles that counts as distance.
+    """Height difference that is part of the distance of two vehicles; 0 if the higher may land.
 
     Args:
         height: height of the first motion above the second [m]; may be negative.
@@ -174,8 +175,8 @@ def height_above(height: float, one_lands: bool, other_lands: bool) -> float:
 
 @part
 def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float]:
-    """Least and largest number of steps by which another vehicle may be ahead of the first, with
-    the first at its step by the server's count.
+    """Least and largest number of steps by which another vehicle may be ahead of the first, if the
+    first is at its step by the server's count.
 
     Args:
         one, other: errors of the steps of both vehicles.
@@ -188,7 +189,7 @@ def shifts(one: StepError, other: StepError, drift: float) -> tuple[float, float
 def moving_shifts(
     other: Motion, begin: float, end: float, least: float, most: float
 ) -> tuple[float, float]:
-    """Part of the shifts from `least` to `most` in which another motion is not at rest.
+    """Bounds of the shifts, between `least` and `most`, at which another motion is not at rest.
 
     Args:
         begin, end: steps between which the motion is evaluated.

@@ -93,7 +93,7 @@ class Graph:
         the next node on it."""
 
     def corners(self, place: Array, goal: Array) -> Array:
-        """Corners of the shortest path between two positions; empty if straight or absent."""
+        """Corners of the shortest path between two positions; empty without a path or corners."""
         start, end, nodes = place[None], goal[None], self._nodes
         if not len(nodes) or self.sees(start, end)[0]:
             return nodes[:0]

@@ -200,7 +200,7 @@ def _sampled_distance(pair: Pair, begin: int, limit: float) -> float:
 
 @part
 def _difference(pair: Pair, step: float, shift: float, x: int) -> float:
-    """Scaled difference of two motions on an axis [m]; the other one is `shift` steps ahead."""
+    """Scaled difference of two motions on an axis [m]; the second motion is `shift` steps ahead."""
     dt_s = pair.metric.dt_s
     position = position_at(pair.one.motion, x, step, dt_s)
     return pair.metric.scale[x] * (position - position_at(pair.other.motion, x, step + shift, dt_s))

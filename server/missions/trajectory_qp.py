@@ -47,7 +47,8 @@ class MotionProblem(NamedTuple):
     H: Array
     f: Array
     A: Array
-    """Rows: rest at the end, inputs at ends and at beginnings of intervals, half-planes."""
+    """Constraint rows, in this order: rest at the end, inputs at the ends and at the beginnings of
+    intervals, half-planes."""
     upper: Array
     lower: Array
     sense: NDArray[np.int32]

@@ -38,8 +38,8 @@ class VehicleMotions:
         self.in_force: SentMotion | None = None
         """Motion that the vehicle flies; None before the first observation."""
         self.is_foreign = False
-        """Whether `in_force` stands for an unknown motion of another server; it is then at rest
-        where the vehicle was last observed."""
+        """Whether the vehicle flies an unknown motion of another server. `in_force` is then a
+        motion at rest where the vehicle was last observed."""
         self.sent: deque[SentMotion] = deque(maxlen=64)
         """Motions sent after the motion in force that may still be accepted, oldest first."""
         self.next: Motion | None = None

@@ -76,7 +76,7 @@ class Waypoints:
                 yield _along(place, way, AHEAD_M)
             yield way[0]
             vehicle.turned_rad = TURN
-            # These waypoints failed: for `detour_steps` routes avoid resting vehicles, too.
+            # All these waypoints failed, so for `detour_steps` routes also avoid resting vehicles.
             vehicle.detour = self._detour(place, goal, resting_places(), vehicle.closed)
             vehicle.detour_until = k + self._detour_steps
             way = vehicle.detour.way(place, goal)
@@ -120,8 +120,8 @@ class Waypoints:
     def _detour(
         self, place: Array, goal: Array, resting: Iterable[Array], closed: Iterable[Array]
     ) -> RoutesAroundZones:
-        """Routes around zones, closed positions, and those nearby vehicles at rest that are not at
-        the goal.
+        """Routes around zones, around closed positions, and around nearby vehicles that rest
+        elsewhere than at the goal.
         """
         zones, keep_m = list(self._zones.zones), self._apart_m - self._tube_m
         for at in resting:

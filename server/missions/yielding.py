@@ -2,8 +2,8 @@
 
 A vehicle without progress towards its goal for a while asks the first vehicle that rests at its own
 goal on the path to yield. The asked vehicle flies to a position off the path, waits there until the
-other has passed, and flies back. Only its goal changes: its motions are planned, checked and sent
-like any other.
+other has passed, and flies back. Only the goal of the asked vehicle changes: its motions are
+planned, checked and sent like any other motion.
 """
 
 from itertools import pairwise
@@ -23,7 +23,8 @@ AHEAD_M = 4.0
 DIRECTIONS = 12
 """Number of directions in which a position for yielding is searched."""
 FURTHER = (1.2, 1.8, 2.7, 4.0)
-"""Distances of such positions from the vehicle's goal, divided by the distance between vehicles."""
+"""Distances from a vehicle's goal at which positions for yielding are searched, divided by the
+distance to keep between vehicles."""
 
 NO_NEARER_M = 1e-4
 """Distance by which a vehicle that is too near may still come nearer: a tolerance [m]."""
@@ -62,8 +63,8 @@ def first_on(way: Array, places: Array, apart_m: float) -> int | None:
 def _kept_distance(places: Array, at: Array, apart_m: float) -> Array:
     """Distances to keep between a vehicle at `at` and vehicles at some positions [m]; shape (n,).
 
-    This is `apart_m`, the distance that plans keep. A vehicle that is nearer already may stay, but
-    not come nearer.
+    The distance is `apart_m`, which plans keep. A vehicle that is nearer already may stay, but not
+    come nearer.
     """
     distance: Array = np.minimum(apart_m, np.linalg.norm(places - at, axis=1) - NO_NEARER_M)
     return distance

@@ -17,7 +17,7 @@ class PlanMemory(NamedTuple):
     """Latest plans of both MPCs for every vehicle."""
 
     # The plans of a thousand vehicles take 0.8 MB, because inputs are float32 and states are not
-    # stored. With float64 and states it was four times as much, more than the cache of a core.
+    # stored. With float64 and stored states they took four times as much: more than a core's cache.
     inputs: S4
     """Latest inputs U(k-1) [m/s], rounded as sent; shape (2, capacity, axes, H)."""
     start: F3
@@ -79,7 +79,8 @@ def _deviate(
     axis: int,
     distance: F1,
 ) -> None:
-    """Add one axis to the squared distances between the paths by `held` and the previous plan.
+    """Add one axis to the squared distances between the previous plan's path and the path of the
+    inputs already sent (`held`).
 
     Args:
         i: index of the vehicle in the block.

@@ -3,7 +3,7 @@
 Both are the MPC of eq. (9), one after the other, each warm-started from its own previous plan. The
 generator plans from its own last prediction and never uses the vehicle's state (E17); the tracker
 controls the vehicle's estimated state along the generator's plan. The figures of a plan are V of
-eq. (16), and the cost and deviation of the flight with the inputs sent before.
+eq. (16), and the cost and the deviation of a flight with the inputs sent before.
 
 With the exact solver all of this is one compiled pass for one or several vehicles
 (`server.mpc.problem`). With any other solver there are five steps: set up and solve the generator's
@@ -159,7 +159,7 @@ class Planner:
 
     def _plan_all(self, batch: PlanBatch, rows: Indices, step: Indices) -> None:
         solver, undone = self.solvers[LATER], len(rows)
-        # Not isinstance: the compiled pass would not call the `solve` of a derived class.
+        # Derived classes are excluded, because the compiled pass would not call their `solve`.
         if type(solver) is ExactSolver:
             undone = _plan(batch, rows, step, solver.work)
         if undone:
@@ -185,8 +185,8 @@ class Planner:
     def _plan_with_solvers(
         self, batch: PlanBatch, rows: Indices, step: Indices, undone: int
     ) -> None:
-        """Plan with `solvers` for all vehicles, or for those whose QP the compiled pass has not
-        solved.
+        """Plan with `solvers` for all vehicles, or for the vehicles whose QP the compiled pass has
+        not solved.
         """
         left = np.arange(len(rows))
         if undone < len(rows):
@@ -324,8 +324,8 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
     for i in range(len(rows)):
         begin(memory, foresight.ahead[i], figures[i], rows[i], steps[i])
         if figures[i].fresh:
-            # Planned alone: vehicles planned for together need the same weights, and a first plan
-            # has other weights (E8). First plans are rare.
+            # A first plan is made alone, because it has other weights (E8), and plans made together
+            # need the same weights. First plans are rare.
             batch.single[0] = i
             undone += _plan_some(batch, batch.alone, batch.single, FIRST, work)
         elif memory.bounded[rows[i]]:
@@ -380,7 +380,7 @@ def conclude_given(batch: PlanBatch, n: int) -> None:
 
 @kernel
 def _conclude_all(batch: PlanBatch, left: I1, sloping: bool) -> None:
-    """Fill in figures, store plans; `sloping`: `draft.gradient` still has g, not the slope."""
+    """Fill in figures and store plans; `sloping`: whether `draft.gradient` has g, not the slope."""
     draft, simd = batch.draft, simd_batch(batch.alone)
     for i in left:
         which = FIRST if batch.figures[i].fresh else LATER

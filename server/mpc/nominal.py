@@ -1,4 +1,4 @@
-"""Nominal MPC: its plan becomes the trajectory if the server sees the reference ahead.
+"""Nominal MPC: its plan becomes the trajectory if the server knows future reference states.
 
 The nominal MPC is the MPC of eq. (9) for an undisturbed vehicle, within the input bounds of eq.
 (6). It starts from the reference state at step k, and follows the reference as far as the server
@@ -55,7 +55,7 @@ def make_nominal(terms: Terms, control: ControlConfig, capacity: int) -> Nominal
 
 @part
 def plan_nominal(nominal: Nominal, row: int, k: int, desired: F3, states: F3) -> bool:
-    """Fill in the nominal states of a vehicle from k on; False if the QP is not solved.
+    """Fill in the planned states of a vehicle from k on; return False if the QP is not solved.
 
     Args:
         desired: states from k on [m, m/s]; shape (axes, H + 1 or more, 2).

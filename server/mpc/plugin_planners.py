@@ -122,7 +122,7 @@ class PluginPlanners:
             if own.planner is None:
                 own.planner = self._make()
             return own.planner.plan(state, reference, previous)
-        except SystemExit as error:  # must not end other flights
+        except SystemExit as error:  # a planner must not end the flights of other vehicles
             raise RuntimeError(f"got SystemExit: {error}") from error
 
     def _checked(self, own: VehiclePlanner, start: int, answer: Any) -> Array | None:
@@ -153,7 +153,7 @@ class InputPlanner(Planner):
 
     A planner's result replaces the plan of the MPC's generator, which assumes no disturbance. The
     plan sent is this result minus the disturbance, in place of the tracker's. Unlike the generator,
-    a planner starts from the vehicle's state. So triggers compare with the plan that was sent last.
+    a planner starts from the vehicle's state. So triggers compare its plan with the last sent one.
     """
 
     def __init__(self, fleet: Fleet) -> None:

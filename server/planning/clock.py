@@ -6,8 +6,9 @@ its reception time (server) minus its sending time (vehicle), and contains G, th
 
     offset = (min G - min F) / 2,    bound = (min F + min G) / 2
 
-where the offset is the vehicle's clock minus the server's, and the bound is its largest error:
-whether the two smallest delays are equal is unknown. Step k begins at k Δt of the vehicle.
+where the offset is the vehicle's clock minus the server's, and the bound is the largest error of
+this estimate, because the two smallest delays may differ. Step k begins at k Δt of the vehicle's
+clock.
 
 Independently of this estimate there are two bounds that hold for any delays. A delay is never
 negative, so the true offset O is at least -F and at most G at the time of each sample, and changes
@@ -17,9 +18,10 @@ by at most DRIFT of the elapsed time:
 
 over all samples of any age.
 
-Two settings narrow these bounds: the operator's bound on the difference of the smallest delays of
-the two directions, and the time of day if both ends know it. Each is checked against the bounds
-from delays and against its own earlier values, and is no longer used once it contradicts them.
+The bounds are narrowed by `link.asymmetry_s`, the operator's bound on the difference of the
+smallest delays of the two directions, and by the time of day if both ends know it. Each of the two
+is checked against the bounds from delays and against its own earlier values, and is no longer used
+once it contradicts them.
 """
 
 from enum import IntEnum
@@ -77,7 +79,8 @@ class VehicleClock:
     newest: int
     """Interval of the newest sample, counted from zero of the server's clock."""
     heard: int
-    """Count of packets in the newest observation (`Observation.heard`); -1 before the first."""
+    """Number of the server's packets that had arrived aboard at the newest observation
+    (`Observation.heard`); -1 before the first."""
     echoes: int
     """Number of the server's packets for which the vehicle has reported G."""
     adopted: int
@@ -92,19 +95,22 @@ class VehicleClock:
     """Earliest time at which the newest observation can have been sent, by the server's clock [ns];
     UNSEEN before the first."""
     echo: int
-    """As `heard`, in the newest observation that arrived in order; -1 before the first."""
+    """Value of `heard` at the newest observation that arrived in order; -1 before the first."""
     echoed: int
     """Earliest possible arrival aboard of packet number `echo`, by the server's clock [ns]."""
     steps: int
     """Number of times that a sample contradicted the bounds from delays."""
     other_low: int
-    """Lower bound of the true offset by settings and time of day, at the time `other` [ns]."""
+    """Lower bound of the true offset at the time `other` [ns], from `link.asymmetry_s` and the time
+    of day; -UNSEEN if there is none."""
     other_high: int
-    """Upper bound of the true offset by settings and time of day, at the time `other` [ns]."""
+    """Upper bound of the true offset at the time `other` [ns], from `link.asymmetry_s` and the time
+    of day; UNSEEN if there is none."""
     other: int
     """Server's time at which `other_low` and `other_high` hold [ns]."""
     doubted: int
-    """1 if the time of day was contradicted; from then on the union of all bounds is used."""
+    """1 once the time of day has contradicted the bounds from delays, or its own earlier values.
+    From then on the offset's bounds are the wider ones that include both."""
     uneven: int
     """1 if the operator's bound on the delays was contradicted, and is no longer used."""
 
@@ -201,7 +207,7 @@ class ClockMap:
         Args:
             forward_ns: F [ns].
             backward_ns: G [ns].
-            heard: number of the server's packets that have arrived aboard, up to that of G.
+            heard: number of the server's packets that have arrived aboard, including that of G.
             now_ns: server's time of reception [ns].
             is_newest: whether the observation is the vehicle's newest; the age of the G in an older
                 observation is unknown.
@@ -287,7 +293,7 @@ def _by_delays(seen: Seen, row: int, now: int) -> tuple[int, int]:
 
 @part
 def _by_others(seen: Seen, row: int, now: int) -> tuple[int, int]:
-    """Bounds of a vehicle's clock offset from settings and time of day [ns]."""
+    """Bounds of a vehicle's clock offset from `link.asymmetry_s` and the time of day [ns]."""
     vehicle = seen.vehicles[row]
     drift = abs(now - vehicle.other) // DRIFT + 1 if vehicle.other_high < UNSEEN else 0
     return vehicle.other_low - drift, vehicle.other_high + drift
@@ -311,7 +317,7 @@ def _bounds(seen: Seen, row: int, now: int, bounds: I1) -> None:
 
 @part
 def _narrow(seen: Seen, row: int, low: int, high: int, now: int) -> bool:
-    """Narrow the bounds by settings and time of day [ns]; reset them and return False if empty."""
+    """Narrow `other_low` and `other_high` [ns]; on a contradiction reset both and return False."""
     vehicle = seen.vehicles[row]
     other_low, other_high = _by_others(seen, row, now)
     trip_low, trip_high = _by_delays(seen, row, now)
@@ -365,15 +371,15 @@ def _bound(
     """Narrow the bounds of a clock offset by F and G [ns]; returns a `Contradiction`."""
     vehicle = seen.vehicles[row]
     low, high = _by_delays(seen, row, now)
-    # A newly reported packet arrived aboard after the previous observation was sent. If that is
-    # unknown, or for an overtaken observation, the packet is at most SESSION_NS old.
+    # A newly reported packet arrived aboard after the previous observation was sent. If the time of
+    # sending is unknown, or the observation was overtaken, the packet is at most SESSION_NS old.
     is_new = is_newest and heard != vehicle.echo
     if is_new:
         vehicle.echoed = vehicle.sent if vehicle.sent < UNSEEN else now - SESSION_NS
         vehicle.echo = heard
     age = max(now - vehicle.echoed, 0) if heard == vehicle.echo else SESSION_NS
-    # F is as old as the observation: at most the round trip, plus the drift of the clocks that
-    # measure the round trip.
+    # The age of F is the observation's delay: at most the round trip, plus the drift of the clocks
+    # that measure the round trip.
     trip = max(forward + backward, 0) + age // DRIFT + 1
     low = max(low, -forward - trip // DRIFT - 1)
     if is_new:
@@ -382,8 +388,8 @@ def _bound(
         vehicle.sent = now - trip
     contradiction = CLOCK if low > high else NOTHING
     if contradiction == CLOCK:
-        # All earlier bounds are void. If a clock was set in between, the round trip of the newest
-        # sample may be negative.
+        # All earlier bounds are void. If a clock was set since the earlier samples, the round trip
+        # of the newest sample may be negative.
         vehicle.steps += 1
         drift = max(age, trip) // DRIFT + 1
         low, high = min(-forward, backward) - drift, max(-forward, backward) + drift
@@ -410,7 +416,7 @@ def _observe(
         vehicle.heard = heard
         seen.echoes[row, vehicle.echoes % ECHOES] = backward
         vehicle.echoes += 1
-    # At most one turn of the ring, even after a long time without observations.
+    # The loop goes around the ring once at most, even after a long time without observations.
     for passed in range(max(vehicle.newest + 1, bucket - BUCKETS + 1), bucket + 1):
         slot = passed % BUCKETS
         seen.minimum[row, 0, slot], seen.minimum[row, 1, slot] = UNSEEN, UNSEEN

@@ -2,8 +2,8 @@
 
 The plan at step k covers the steps from k + d to k + d + H. `reference.preview` limits how far
 ahead the server may look: with "all" it sees the whole window, otherwise nothing after the step k +
-preview. Later states are extrapolated from the last visible state at its velocity; a moving
-target's are also reflected at the bounds of its region (docs/schemes.md lists rejected
+preview. Later states are extrapolated from the last visible state at its velocity; the states of a
+moving target are also reflected at the bounds of its region (docs/schemes.md lists rejected
 alternatives). For a point that an operator moves in flight (`live`), only the present state is
 known; this state is the same for all vehicles.
 
@@ -69,7 +69,7 @@ class Desired:
 
     Args:
         block: largest number of vehicles in one call.
-        references: trajectory of each vehicle, by its number; default: the scenario's for all.
+        references: trajectory of each vehicle, by its number; None: the scenario's trajectory.
     """
 
     def __init__(

@@ -42,7 +42,7 @@ class LivePoint:
                 return np.stack([self._position, self._velocity], axis=-1)
             # With a given velocity the point moves from the first call on.
             self._moved_ns = now_ns
-        # At least 0: a tick may be due before the time of a move that has just arrived.
+        # The time is at least 0, because a tick may be due before a move that has just arrived.
         since_s = max(0, now_ns - self._moved_ns) / SECOND_NS
         if not self._has_velocity and since_s > REST_S:
             return np.stack([self._position, np.zeros_like(self._velocity)], axis=-1)

@@ -1,4 +1,4 @@
-"""Errors of a plug-in's code in flight: they are counted and reported, and end no flight."""
+"""Errors of a plug-in's code in flight: they are counted and reported, but end no flight."""
 
 from traceback import format_exception
 

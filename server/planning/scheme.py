@@ -71,7 +71,7 @@ class Foresight(NamedTuple):
     disturbance: F2
     """Estimated disturbance ŵ, as an equivalent input [m/s]; shape (block, axes)."""
     horizons: S3
-    """Horizons to send, from step k on: d committed inputs, then H planned ones [m/s]; shape
+    """Horizons to send, from step k on: d committed inputs, then H planned inputs [m/s]; shape
     (block, axes, largest d + H)."""
     feedback: S3
     """Feedback columns of a horizon, see `wire.protocol.Horizon`; shape (block, axes, FEEDBACK)."""
@@ -100,7 +100,7 @@ class PlanFigures:
     fresh: bool
     """Whether no usable previous plan exists: first step, or a gap longer than H."""
     solved: bool
-    """Whether the solver has found a plan; without one nothing is sent."""
+    """Whether the solver has found a plan; without a plan nothing is sent."""
 
 
 FIGURES = record(PlanFigures)
@@ -156,7 +156,7 @@ make_header: Callable[[tuple[int, int, int, int, int]], Header] = partial(tuple.
 
 
 class Batch(NamedTuple):
-    """Vehicles planned for together, and those whose plan is sent."""
+    """Vehicles planned for together, and the vehicles among them whose plan is sent."""
 
     rows: Indices
     """Rows of the vehicles; shape (n,)."""
@@ -180,8 +180,9 @@ class SentPlans(NamedTuple):
 
 
 Planning = Callable[[Sequence[tuple[int, Callable[[], Any]]]], list[Any]]
-"""Function that runs planners of plug-ins, given by number and call. Returns each one's result or
-exception: TimeoutError if it takes too long, `queue.Full` if too many hang for it to be run."""
+"""Function that runs planners of plug-ins, each given by its number and its call. It returns each
+planner's result or exception: TimeoutError if the planner takes too long, `queue.Full` if it was
+not run because too many planners hang."""
 
 
 Tell = Callable[[str, str], None]
@@ -295,10 +296,10 @@ class Scheme(ABC):
     changeable: frozenset[str] = frozenset()
     """Keys that may be changed in flight, in addition to the server's own."""
     keeps_rows = False
-    """Whether silent vehicles keep their rows."""
+    """Whether a vehicle keeps its row when its packets no longer arrive."""
     limits: Any = None
-    """Limits (`shared.law.limits`) of motions if all vehicles have to follow the same server, whose
-    standby needs equal limits; None if each vehicle may follow another server."""
+    """Limits (`shared.law.limits`) of motions, which a leader and its standby must have in common
+    if all vehicles must follow the same server; None if vehicles may follow different servers."""
 
     def change(self, scenario: Scenario, keys: frozenset[str]) -> None:  # noqa: B027
         """Use changed keys; called only if `objection` has returned no reason."""
@@ -316,7 +317,9 @@ class Scheme(ABC):
         return {}
 
     def follow(self, row: int, lead: RoomMessage | None) -> None:  # noqa: B027
-        """Note who leads a vehicle, and its motion in force; None if this is its only server."""
+        """Store which server leads a vehicle, and the vehicle's motion in force, as its message
+        `lead` reports them. `lead` is None if the vehicle has only this server.
+        """
 
     def leave(self) -> int:
         """Plan nothing further, because the server ends. Return the longest time until all vehicles
@@ -334,7 +337,7 @@ class Scheme(ABC):
 
 
 Given = Callable[[int], Reference] | None
-"""Desired trajectory of each vehicle by its number; None if all have that of the scenario."""
+"""Desired trajectory of each vehicle by its number; None: all have the scenario's trajectory."""
 
 
 def given_references(scenario: Scenario, given: Given, most: int) -> Given:
@@ -352,5 +355,5 @@ class SchemeCode(NamedTuple):
     """Modules and packages whose kernels only this scheme calls, for the text of
     `control.scheme`."""
     references: Callable[[Scenario, Given, int], Given] = given_references
-    """Function that makes the scheme's desired trajectories from given ones; the last argument is
-    the largest number of vehicles."""
+    """Function that makes the scheme's desired trajectories from given trajectories; the last
+    argument is the largest number of vehicles."""

@@ -26,7 +26,7 @@ class SplineScheme(Scheme):
         age = step - self.observed_step[rows]
         # A trajectory that is sent again may be older than the newest observation: then its age is
         # negative, and 0 is sent. A new trajectory's age is negative after the server's clock was
-        # set; it is sent unchanged, as step minus age must be the step of an observation.
+        # set; this age is sent unchanged: step minus age must be the step of an observation.
         age = np.where(old > 0, np.maximum(age, 0), age)
         columns = (sent, rows, step, age, splines.spacing[sent], splines.number[sent])
         for i, row, k, age_steps, spacing, n in zip(*map(np.ndarray.tolist, columns), strict=True):

@@ -1,4 +1,4 @@
-"""The scheme "committed": plans start at k + d, after the inputs that sent horizons have fixed.
+"""The scheme "committed": plans start at k + d, after the inputs fixed by horizons already sent.
 
 A horizon reaches the vehicle within d steps (the delay bound) or is lost. So the inputs of the next
 d steps are fixed by the horizons already sent: these inputs are committed. The server predicts with
@@ -17,7 +17,7 @@ w is the disturbance (wind, a wrong gain) as an equivalent input, estimated by
 
 With feedback aboard, a horizon also carries its reference state x̄, which starts at x̂(k), and the
 vehicle flies u(i) + K (x̄(i) - x(i)). The server replays this feedback too. The committed inputs
-are then those that the vehicle flies along x̄ without further disturbance. K never changes, so the
+are then the inputs of a flight along x̄ without further disturbance. K never changes, so the
 time at which the next horizon replaces the present one does not matter.
 
 `schemes.sent` tracks the horizons sent, `schemes.sent_horizons` stores them, `schemes.replay`

@@ -73,11 +73,11 @@ def add_sample(bound: DelayBound, row: int, delay: int) -> None:
     newest = bound.seen[row] % SAMPLES
     bound.samples[row, newest] = delay
     bound.seen[row] += 1
-    # d rises at once: if d is too small, the inputs before each horizon differ from those that its
-    # plan assumes.
+    # d rises at once: if d is too small, the vehicle flies other inputs before each horizon than
+    # the plan of the horizon assumes.
     d = max(bound.steps[row], min(delay, bound.most))
     count = min(bound.seen[row], SAMPLES)
-    needed, since = 0, count  # number of samples >= d, and of samples since the last of them
+    needed, since = 0, count  # number of samples of d or more, and of samples after the last such
     for slot in range(count):
         if bound.samples[row, slot] >= d:
             age = newest - slot if slot <= newest else newest - slot + SAMPLES

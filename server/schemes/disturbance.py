@@ -30,7 +30,7 @@ def observe_disturbance(
     schedule: HorizonSchedule,
     track: FlownTrack,
 ) -> None:
-    """Update the disturbance at an observation; a long `trip` [steps] slows the update."""
+    """Update the disturbance at an observation, slower if many (`trip`) steps before planning."""
     seen, sent = memory.seen[row], memory.sent
     delivery = sent.delivery[row]
     begin, end = seen.base_step, sent.observed[row]

@@ -129,7 +129,7 @@ class Packing:
 
     Args:
         most: largest number of inputs of a horizon on each axis.
-        planned: number of planned inputs H; the others are committed.
+        planned: number of planned inputs H; the inputs before them are committed.
     """
 
     def __init__(self, axes: int, most: int, planned: int) -> None:

@@ -17,8 +17,9 @@ from skytether.shared.law.terms import Terms
 from skytether.shared.scenario.schema import ControlConfig
 
 TRIP_NS = 1_500_000_000
-"""Longest time from an observation to the start of the plan at which the observer keeps its full
-speed [ns]: beyond it, T = `control.observer_s` makes the control loop oscillate."""
+"""Longest time from an observation to the start of the plan for which the observer's time constant
+is T = `control.observer_s` [ns]. For longer times the observer is slower: with T the control loop
+would oscillate."""
 
 
 def decay_of(terms: Terms, control: ControlConfig) -> float:

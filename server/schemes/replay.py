@@ -79,7 +79,7 @@ def fly_schedule(
 
     Args:
         legs: number of legs of the schedule.
-        end: step after the last flown one.
+        end: step after the last flown step.
         x: observation at the first step: position [m], velocity [m/s], input flown on this axis
             [m/s], and magnitude of the input over all axes [m/s].
         track: output: inputs and states from the first step on.
@@ -160,7 +160,7 @@ def _fly(
     for k in range(first, last):
         u, _, ref_p, ref_v = step(horizon, k - made_for, ref_p, ref_v, p, v)
         if k == begin:
-            u = first_input  # the observed input replaces that of the rule of flight
+            u = first_input  # the observed input replaces the input by the rule of flight
         track.commands[k - begin] = u
         track.states[k - begin, 0], track.states[k - begin, 1] = p, v
         p, v = advance(horizon.model, p, v, u + w)

@@ -26,7 +26,7 @@ from skytether.shared.scenario.schema import ControlConfig
 from skytether.shared.wire.protocol import NO_HORIZON
 
 HOVERS, UNKNOWN = -1, -2
-"""Values in place of a plan's number. HOVERS: no plan is in force, the vehicle brakes and hovers.
+"""Values in place of a plan's number. HOVERS: no plan is in force; the vehicle brakes and hovers.
 UNKNOWN: the plan is not stored; it was sent before a restart of the server or dropped aboard."""
 MARGIN = 2
 """Steps added to half a round trip for the first delay bound, before any acknowledgement."""
@@ -44,11 +44,11 @@ class Delivery:
     acknowledged: int
     """Step that the newest plan with a delay sample was made for, or NO_HORIZON."""
     judged: int
-    """Step up to which every plan due has been judged: arrived or lost."""
+    """Step up to which every due plan has been counted as arrived or as lost."""
     sent: int
     """Number of plans sent so far."""
     first: int
-    """Number of the first plan that the vehicle may still have; it has dropped earlier plans."""
+    """Number of the first plan that the vehicle may still have; all earlier plans are dropped."""
     loss: float
     """Loss rate of recent plans, from 0 to 1."""
 
@@ -75,7 +75,7 @@ class Sent(NamedTuple):
 
 
 def nothing_sent(capacity: int, ring: int, terms: Terms, control: ControlConfig, most: int) -> Sent:
-    """Tracker without any plan; `most` is the largest delay bound d that fits a plan."""
+    """Tracker before any plan is sent; `most`: largest value of the delay bound d [steps]."""
     fixed_s = None if control.delay_bound == "auto" else control.delay_bound
     sent = Sent(
         observed=np.full(capacity, -1, dtype=np.int64),
@@ -105,8 +105,8 @@ def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
     if bound.steps[row] == 0:
         set_first(bound, row, -(-half_trip_ns(clock, row) // sent.dt_ns) + MARGIN)
     raise_to(bound, row, -(-shortest_ns(clock, row) // sent.dt_ns))
-    # Plans made after the plan in force that are due now are lost. They stay in the ring, and
-    # `judged` prevents counting them twice.
+    # A plan that was made after the plan in force and is due by now is lost. Lost plans stay in the
+    # ring, and `judged` prevents counting them twice.
     lost = 0
     for number in range(first_after(sent, row, delivery.in_force), delivery.sent):
         if delivery.judged < sent.plans[row, number % sent.plans.shape[1]].due <= observed:

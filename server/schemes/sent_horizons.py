@@ -144,7 +144,7 @@ def store_sent(
         for axis in range(len(settings.laws)):
             for stage in range(length):
                 memory.inputs[row, slot, axis, stage] = foresight.horizons[i, axis, stage]
-            # Computed as in `HorizonFollower` aboard: both ends have to brake from the same speed.
+            # The speed is computed as in `HorizonFollower` aboard: both ends brake from this speed.
             last = bounded(
                 float(foresight.horizons[i, axis, length - 1]), settings.laws[axis].bound
             )

@@ -14,7 +14,7 @@ PLUGINS = f"{__package__}.plugins"
 
 
 def code_of(scenario: Scenario, *, apart: bool = True) -> SchemeCode:
-    """Code of a scenario's scheme, or that of missions if `apart` and the scenario is a mission."""
+    """Code of a scenario's scheme; code of missions if `apart` is True and it is a mission."""
     if apart and scenario.keeps_apart:
         module = load(SCHEME_APART, "missions")
     else:

@@ -191,8 +191,8 @@ class Guidance(SplineScheme):
         self.observed_step[row] = observation.step
         delivery["in_force"], delivery["since"] = observation.in_force, observation.since
         self._memory.state[row] = observation.state
-        # A vehicle that accepts no trajectories has dropped all received ones, and will drop those
-        # in flight.
+        # A vehicle that accepts no trajectories has dropped all received trajectories, and will
+        # drop the trajectories in flight.
         if not observation.takes:
             delivery["first"], delivery["in_force"] = delivery["sent"], NO_HORIZON
         return True
@@ -349,7 +349,7 @@ def _intend(
 
 @inline
 def _newest(sent: Sent, row: int, first: int) -> int:
-    """Number of the newest trajectory that may arrive, or else is in force; negative if none."""
+    """Number of the newest trajectory in flight, else of the trajectory in force, or negative."""
     delivery = sent.delivery[row]
     if first < delivery.sent:
         return delivery.sent - 1
@@ -382,8 +382,8 @@ def _begin(
         for number in range(first, delivery.sent):
             ends = max(ends, memory.trajectories[row, number % RING].ends)
         plan.row, plan.step, plan.start, plan.gap, plan.solved = row, k, k, 1, True
-        # Only if a new trajectory could be flown at k + d: otherwise one would be sent at every
-        # step.
+        # `fresh` only if a new trajectory could be flown at k + d; otherwise a trajectory would be
+        # sent at every step.
         plan.fresh = ends <= k + d <= observed + settings.age_max
         newest = _newest(sent, row, first)
         for axis in range(axes):
@@ -399,7 +399,7 @@ def _begin(
 def _appraise(
     settings: Settings, memory: Memory, rows: I1, steps: I1, figures: Figures, intended: F4
 ) -> None:
-    """Fill in the gaps between the trajectories sent before and those that would be sent now."""
+    """Fill in the gaps between trajectories sent before and trajectories that would be sent now."""
     sent = memory.sent
     for i in range(len(rows)):
         row, k, plan = rows[i], steps[i], figures[i]
@@ -425,7 +425,8 @@ def _appraise(
         if not plan.fresh:
             newest = _newest(sent, row, first)
             plan.cost_gap, plan.deviation_m = _gap(settings, memory, intended[i], row, newest, k, d)
-        # The trajectory in force ends soon; if all those in flight are lost, the vehicle brakes.
+        # The trajectory in force ends soon; if the loss of all later trajectories is likely enough,
+        # a new one is sent, or the vehicle would brake.
         soon = in_force_ends <= k + COMPARED * d <= observed + settings.age_max
         plan.fresh |= soon and share > RUNS_OUT
 

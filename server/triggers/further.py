@@ -23,8 +23,8 @@ from skytether.shared.wire.protocol import AXES_MAX
 
 @trigger(needs="deviation_m")
 def deviation(situation: Situation, metres: Amount = 0.05) -> Verdict:
-    """Sends if the flight with the inputs already sent would deviate from the plan by more than
-    `metres`.
+    """Sends if the flight with the inputs already sent would deviate from the previous plan by more
+    than `metres`.
     """
     return above(situation, Compared.DEVIATION_M, metres)
 
@@ -116,11 +116,11 @@ class Budget(Trigger):
         return timed(filled >= 1.0, situation.figures)
 
     def sent(self, rows: Indices, figures: Figures) -> None:
-        # At least 0, even if another policy has sent a packet without a token.
+        # The number of tokens is at least 0, even if another policy sent a packet without a token.
         self._tokens[rows] = np.maximum(self._filled(rows, figures) - 1.0, 0.0)
         self._step[rows] = figures["step"]
 
     def _filled(self, rows: Indices, figures: Figures) -> Array:
         gained = self._gain * (figures["step"] - self._step[rows])
-        # Computed from the number of steps passed, so that missed ticks fill the bucket too.
+        # The gain counts all steps since the last packet, so that missed ticks fill the bucket too.
         return np.minimum(self._tokens[rows] + gained, self._burst)

@@ -59,7 +59,7 @@ class Silence(Periodic):
     """Sends after the given time without a packet [s], or after half a horizon if that is shorter.
 
     A horizon that is replaced at half its length does not run out even if the first replacement is
-    lost. Trajectories do not run out, so only the seconds count for them.
+    lost. Trajectories do not run out, so for trajectories only the given time counts.
     """
 
     def __init__(

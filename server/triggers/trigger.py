@@ -1,9 +1,9 @@
 """Triggers, which decide when a horizon is sent: small policies combined with & and |.
 
 A scenario writes `cost_gap & budget(5, 2) | silence(1)` (`shared.scenario.grammar`). Policies are
-entries of the table `TRIGGERS` (`shared.scenario.registry`): ours in `policies`, `gaps`,
-`schedules` and `further`, and those of plug-ins. docs/triggers.md explains their use, and how to
-write one.
+entries of the table `TRIGGERS` (`shared.scenario.registry`): the built-in policies in `policies`,
+`gaps`, `schedules` and `further`, and policies of plug-ins. docs/triggers.md explains how to use
+and how to write a policy.
 
 The server evaluates the trigger once per step, after planning. Every policy but `budget` fires for
 a vehicle without a usable previous plan (`fresh`: first step, or a gap longer than H; E18).
@@ -250,7 +250,7 @@ class Combined(Trigger):
 
     def test(self, situation: Situation) -> Verdict:
         left, right = self._left.test(situation), self._right.test(situation)
-        # The record has one figure: that of the leftmost policy that compares a figure.
+        # The record has one figure: the figure of the leftmost policy that compares figures.
         shown = left if left.compares or not right.compares else right
         event = self._combine(left.event, right.event)
         return _verdict((event, shown.figure, shown.threshold, shown.compared))

@@ -53,7 +53,7 @@ def need(extra: str) -> None:
 
 def _extras() -> dict[str, list[str]]:
     """Modules of each extra; their names are the packages' names, except for MODULES."""
-    from importlib import metadata  # importing it takes a tenth of the client's start-up time
+    from importlib import metadata  # this import takes a tenth of the client's start-up time
 
     extras: dict[str, list[str]] = {}
     for requirement in metadata.requires("skytether") or ():

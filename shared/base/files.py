@@ -73,13 +73,13 @@ def claim(path: Path) -> None:
 
 
 def claim_folder(path: Path) -> None:
-    """Lock a folder for writing files until the command ends; a missing one is created.
+    """Lock a folder for writing files until the command ends; a missing folder is created.
 
     Raises:
         OSError: the folder cannot be created, or another command has locked it.
     """
     path.mkdir(parents=True, exist_ok=True)
-    # Not on Windows, which cannot open folders; once for two options that name the same folder.
+    # Windows cannot open folders. A folder that two options name is locked only once.
     if hasattr(os, "O_DIRECTORY") and not use(inode(path)):
         with _claimed(path, os.open(path, os.O_RDONLY | os.O_DIRECTORY)):
             pass
@@ -177,7 +177,7 @@ def replacing(
 
     Args:
         path: final path of the file.
-        mode: permissions of the file; None: those of the file that it replaces.
+        mode: permissions of the file; None: the permissions of the file that it replaces.
         is_new: whether an existing file is an error.
         is_synced: whether the file is synced to disk at the end.
 
@@ -225,8 +225,8 @@ def held(path: Path, flags: int = os.O_RDONLY) -> BinaryIO:
 class Growing:
     """File that grows during a flight, and that others may read while it grows.
 
-    It has its final name from the start. If an older file has that name, the new one is called
-    NAME.part1.SUFFIX until it is complete, see `end`.
+    The file has its final name from the start. If an older file has that name, the new file is
+    called NAME.part1.SUFFIX until it is complete, see `end`.
 
     Args:
         buffering: as in `open`; 0: no buffer.

@@ -33,7 +33,7 @@ def use(of: Inode) -> Use | None:
 
 
 def open_flags(*names: str) -> int:
-    """Flags for `os.open` by their names, without those that this system lacks."""
+    """Flags for `os.open` by their names, without flags that this system lacks."""
     # Windows would translate line ends.
     return reduce(or_, (getattr(os, name, 0) for name in ("O_BINARY", *names)))
 

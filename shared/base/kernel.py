@@ -96,8 +96,8 @@ def _at_first_call(dispatcher: Any) -> Any:
         compile_kernel(dispatcher)
         answer = dispatcher(*arguments)
         (compiled,) = dispatcher.overloads.values()
-        # A partial without arguments: the function in it can be replaced, and a call costs less
-        # than that of a method.
+        # A partial without arguments: the function in it can be replaced, and calling it costs less
+        # than calling a method.
         code = dispatcher if _CHECKED else compiled.entry_point
         call.__setstate__((code, (), {}, call.__dict__))
         return answer
@@ -206,8 +206,8 @@ class PartLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
     """Code of a part: optimised and turned into machine code only within kernels that it is linked
     into.
 
-    Numba would do both for each function alone, and again in each caller, and make wrappers, which
-    a part does not need: all kernels of `demo` took 21 s of CPU instead of 12.
+    Numba would optimise and translate each function alone, and again in each caller, and make
+    wrappers, which a part does not need: all kernels of `demo` took 21 s of CPU instead of 12.
     """
 
     def _optimize_final_module(self) -> None:
@@ -280,7 +280,7 @@ def inline(function: F) -> F:
 
 
 def shared(function: F) -> F:
-    """Python function, returned unchanged, that kernels may now call, like all that it calls."""
+    """Let kernels call a Python function and all functions that it calls; returns the function."""
     for each in _dependencies(function):
         if inspect.isfunction(each) and each not in _SHARED:
             register_jitable(error_model="numpy", pipeline_class=Linked)(each)

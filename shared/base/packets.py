@@ -1,7 +1,7 @@
 """IP packets of a program for netem: flows, Ethernet frames, answers to packets that are too long.
 
-The addresses are those of slirp4netns, which speaks Ethernet. The program's device has no link
-layer, so only the program's own packets pass it: no ARP, no neighbour discovery (ND).
+The addresses are the defaults of slirp4netns, which speaks Ethernet. The program's device has no
+link layer, so only the program's own packets pass it: no ARP, no neighbour discovery (ND).
 """
 
 import struct
@@ -19,7 +19,8 @@ RESOLVER = IPv4Address("10.0.2.3")
 
 ICMP, ICMP6 = 1, 58
 ECHOES = (0, 8)
-"""ICMP's types of echo reply and echo request: no other ICMP message is answered with an error."""
+"""ICMP types of echo reply and echo request. Of all ICMP messages only these get an ICMP error in
+reply."""
 ERRORS6 = 128
 """Smallest ICMPv6 type that is not an error."""
 DISCOVERY = range(133, 138)
@@ -29,7 +30,8 @@ WITH_PORTS = frozenset((6, 17, 33, 132))
 SHORTEST, SHORTEST6 = 20, 40
 """Sizes of the headers of IPv4 and IPv6 without options [B]."""
 QUOTED, QUOTED6 = 548, 1232
-"""Largest part of a packet quoted in an ICMP error, for an error of at most 576 or 1280 B [B]."""
+"""Largest part of a packet that an ICMP error quotes [B]: with its headers an error has at most
+576 B with IPv4, and 1280 B with IPv6."""
 
 _OUR_MAC, _ITS_MAC = bytes.fromhex("020000000001"), bytes.fromhex("52550a000202")
 _IPV4, _IPV6, _ARP = b"\x08\x00", b"\x86\xdd", b"\x08\x06"

@@ -4,8 +4,7 @@
 def printable(text: str) -> str:
     r"""Text in which invisible characters are replaced by escapes such as `\x1b`.
 
-    Terminals interpret some such characters: they clear the screen, move the cursor, or reverse
-    text.
+    Some invisible characters make a terminal clear the screen, move the cursor, or reverse text.
     """
     if text.isprintable():
         return text

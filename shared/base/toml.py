@@ -2,8 +2,8 @@
 
 The standard library's parser stores every prefix of a dotted key: its memory grows with the square
 of the number of parts, and 26 kB of text take 3.5 GB. Nested brackets end in a RecursionError. So
-the text is first checked for both, in one pass. No other module of the package parses TOML;
-tests/shared/test_toml.py checks it.
+the text is first checked for long keys and nested brackets, in one pass. No other module of the
+package parses TOML, as tests/shared/test_toml.py checks.
 """
 
 import re

@@ -12,5 +12,5 @@ def seconds_to_ns(seconds: float) -> int:
 
 
 JUMP_NS = 60 * SECOND_NS
-"""Largest advance of a clock between readings, or beyond a due wake, that is not a jump, see
-`shared.endpoints.steady`."""
+"""A clock has jumped if it advances by more than this after both the previous reading and the due
+time of the endpoint's next wake [ns]; see `shared.endpoints.steady`."""

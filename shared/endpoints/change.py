@@ -4,8 +4,8 @@
 
 All values of a request take effect together, between two steps of the endpoint, or none does. A
 request is a JSON object of values by key; an empty object requests the list of keys that may
-change. The answer is an `Answer`. `shell.driving.control` has the socket for both, and `sim.flight`
-makes the same changes in virtual time.
+change. The answer is an `Answer`. `shell.driving.control` has the socket for requests and answers,
+and `sim.flight` makes the same changes in virtual time.
 """
 
 from collections.abc import Mapping
@@ -91,7 +91,7 @@ class Running:
             reason = other_directions.named(str(error), self._names)
             self.refuse(reason)
             raise ConfigError(reason) from None
-        # After the check of the whole scenario: a change is made completely, or not at all.
+        # The endpoint changes after the check of the whole scenario: completely, or not at all.
         self.endpoint.change(scenario, frozenset(values), now_ns=now_ns)
         self._scenario, after = scenario, reading.to_table(scenario)
         lasting = {key: value for key, value in values.items() if key not in DECISIONS}
@@ -140,8 +140,8 @@ class Running:
         return msgspec.json.encode(Answer(refused=reason))
 
     def _whole(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """Values by the scenario's keys. The value of a text's argument, as `network.uplink.loss`,
-        is inserted into the present text of its key.
+        """Values by the scenario's keys. The value of a text's argument, such as
+        `network.uplink.loss`, is inserted into the present text of its key.
 
         Raises:
             ConfigError: a key may not change, or a key's text has no such argument.
@@ -161,8 +161,8 @@ class Running:
                 value(table, text)
             except (KeyError, TypeError):
                 shown_key = key[:KEY_SHOWN_MAX]
-                # Any process that can open the socket may send requests: no control characters in
-                # the log.
+                # Any process that can open the socket may send requests, so control characters
+                # are escaped before they reach the log.
                 shown_key = shown_key if shown_key.isprintable() else repr(shown_key)
                 names = [self._names.get(each, each) for each in may]
                 raise ConfigError(f"{shown_key}: no such key; {hint(key, names)}") from None

@@ -22,7 +22,7 @@ brackets, with a scope if needed, as in `fe80::1%eth0`."""
 
 NETWORK_BYTES = 8
 """Length of the network part of an IPv6 address, which identifies a host [B]: the owner of one
-address of a 64-bit network usually has all of them."""
+address of a 64-bit network usually has all of its addresses."""
 
 EVENTS_MAX = 1024
 """Number of events stored until the driver reads them; older events are dropped and counted."""
@@ -86,7 +86,7 @@ class Events(deque[Event]):
         return self
 
     def take(self) -> Sequence[Event]:
-        """Remove and return all events, preceded by the number of dropped ones."""
+        """Remove and return all events, after an `Omitted` for each class of dropped events."""
         omitted = (Omitted(kind=kind, count=count) for kind, count in self._omitted.items())
         events = (*omitted, *self)
         self.clear()
@@ -117,8 +117,8 @@ class Endpoint(ABC):
         self._out: list[Datagram] = []
         self._events = Events()
         self.pending = self._out, self._events
-        """Datagrams and events that `outbox` and `events` return next. A wrapper uses those of the
-        wrapped endpoint, because virtual time calls neither while both are empty."""
+        """Datagrams and events that `outbox` and `events` return next. A wrapper uses the lists of
+        the wrapped endpoint: in virtual time neither method is called while both are empty."""
 
     @abstractmethod
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
@@ -184,8 +184,8 @@ class Endpoint(ABC):
     def figures(self) -> dict[str, Any]:
         """Figures counted so far, by name; a nested dictionary is a group.
 
-        Names are those of fields, or keys of a group: a vehicle's number in `by_vehicle`, a reason
-        in `dropped`, an edge [ms] in `ticks_within_ms`.
+        A name is the name of a field, or a key of a group: a vehicle's number in `by_vehicle`, a
+        reason in `dropped`, an edge [ms] in `ticks_within_ms`.
         """
         return {}
 

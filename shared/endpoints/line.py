@@ -53,7 +53,7 @@ class Listen(NamedTuple):
     """Address for clients; port 0 takes a free port."""
     server: Address
     most: int = CONNECTIONS_MAX
-    """Largest number of connections at once; further ones are closed."""
+    """Largest number of connections at once; further connections are closed."""
 
 
 def parse_address(text: str) -> Address | None:

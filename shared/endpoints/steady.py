@@ -22,8 +22,8 @@ from skytether.shared.scenario.schema import Scenario
 class Steady(Endpoint):
     """Wraps an endpoint, and passes steady time to it.
 
-    An endpoint without a due wake may wait for a datagram for any length of time. So only a step
-    backwards then counts as a jump.
+    An endpoint without a due wake may wait for a datagram for any length of time. So for such an
+    endpoint only a step of the clock backwards counts as a jump.
     """
 
     def __init__(self, inner: Endpoint) -> None:
@@ -45,7 +45,7 @@ class Steady(Endpoint):
     def _is_jump(self, seen_ns: int, now_ns: int) -> bool:
         if now_ns < seen_ns:
             return True
-        # Counted from the due wake: an hour of waiting for a wake is no jump.
+        # The advance counts from the due wake, because an hour of waiting for a wake is no jump.
         due_ns = self.next_wake_ns()
         return due_ns is not None and now_ns - max(seen_ns, due_ns) > JUMP_NS
 

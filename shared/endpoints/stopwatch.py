@@ -19,7 +19,7 @@ class Stopwatch:
             self._since_ns = self._clock_ns()
 
     def lap(self, name: str) -> int:
-        """End the lap, add it to this name, and begin the next; returns its duration [ns]."""
+        """Add the duration of the lap to this name's sum, begin a lap; return the duration [ns]."""
         if self._clock_ns is None:
             return 0
         now_ns = self._clock_ns()

@@ -4,10 +4,10 @@ An endpoint returns its events (`Endpoint.events`); a driver passes them to a lo
 virtual time, or the command that started the process. `str(event)` is a sentence for the operator.
 For programs an event is a JSON object whose key `type` is the name of the class.
 
-This module has the events of all flights. Those of a vehicle on the ground are in `ground`, of
-autopilots in `aboard`, of several paths in `paths`, of a standby server in `standby`, of processes
-in `processes`, of missions in `shared.missions.events`. `shared.telemetry.every_event` decodes them
-all, and imports each of these modules.
+This module has the events of all flights. Other modules have the events of a vehicle on the ground
+(`ground`), autopilots (`aboard`), several paths (`paths`), a standby server (`standby`), processes
+(`processes`) and missions (`shared.missions.events`). `shared.telemetry.every_event` imports all
+these modules and decodes their events.
 """
 
 from typing import Any, Literal, dataclass_transform
@@ -106,7 +106,7 @@ class TooLong(Event):
         "a packet of {size} B is dropped, and so are all longer than network.mtu, which is {most} B"
     )
     size: int
-    """UDP payload [B]."""
+    """Size of the packet's UDP payload [B]."""
     most: int
 
 
@@ -305,8 +305,8 @@ class StateDoubted(VehicleEvent):
 
 
 class SteppedLate(VehicleEvent):
-    """A step of a vehicle on a mission began too late, and later than every step before; until then
-    the vehicle flew its last input.
+    """A step of a vehicle on a mission began too late, with the largest delay so far. The vehicle
+    flew its last input until the step began.
     """
 
     sentence = (

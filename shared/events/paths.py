@@ -1,4 +1,4 @@
-"""Events of a vehicle's paths to its server; `processes` has those of their sockets."""
+"""Events of a vehicle's paths to its server; `processes` has the events of the paths' sockets."""
 
 from skytether.shared.events.flight import VehicleEvent
 

@@ -43,7 +43,7 @@ class PageServed(Event):
     address: str
     """Address for a browser; includes a token if the page may change the flight."""
     taken: str = ""
-    """Requested HOST:PORT if another process uses that address."""
+    """HOST:PORT that was requested but is used by another process; empty if it was free."""
 
     def __str__(self) -> str:
         # Only a space may follow the address, because users copy or click it.

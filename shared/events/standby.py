@@ -20,4 +20,4 @@ class LimitsDiffer(PeerEvent):
 class LeaderChanged(PeerEvent):
     sentence = "vehicle {vehicle}: the server at {peer} leads it now (leadership {number})"
     number: int
-    """Number of the leadership."""
+    """Leadership number."""

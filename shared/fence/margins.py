@@ -10,13 +10,13 @@ from skytether.shared.fence.keys import FenceConfig
 from skytether.shared.scenario.schema import Scenario
 
 SLOW_STEPS = 2
-"""Excess of the time constant T of `client.fence` over the vehicle's [steps]."""
+"""Difference of the time constants: T of `client.fence` minus the vehicle's [steps]."""
 ERROR_S = 0.06
 """Margin for all model errors together, divided by the vehicle's largest speed [s]."""
 WEAK = 1.25
 """Factor on the margin for wind, for a vehicle whose gain is 20 % below the model's."""
 LATER_S = 0.1
-"""Largest excess of the vehicle's dead time over the model's [s]."""
+"""Largest time by which the vehicle's dead time may exceed the model's dead time [s]."""
 
 
 def margins(scenario: Scenario) -> list[float]:

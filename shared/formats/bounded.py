@@ -162,7 +162,7 @@ class _Elements(ElementTree.TreeBuilder):
         super().__init__()
         self._count = 0
         self.has_come = False
-        """Whether an element or text has been parsed since this was last set to False."""
+        """Whether an element or text has been parsed since this flag was last set to False."""
 
     def start(self, tag: Any, attrs: Any, /) -> Any:
         self._count, self.has_come = self._count + 1 + len(attrs), True

@@ -1,9 +1,9 @@
 """DataFlash logs of ArduPilot (`.bin`): the track of one vehicle.
 
 A log describes itself: each message is 0xA3 0x95, its type, and a payload whose fields are named in
-a message FMT (type 128). Places are those of POS, or else of GPS with a fix in 3D; altitudes are
-above the sea. Home is that of ORGN, or else the first place. Between messages, and after an
-incomplete one, bytes are skipped until the next message of a known type.
+a message FMT (type 128). Places are taken from messages POS, or else from messages GPS with a fix
+in 3D; altitudes are above the sea. Home is taken from ORGN, or else it is the first place. Between
+messages, and after an incomplete message, bytes are skipped until the next message of a known type.
 
 pymavlink's reader needs the name of a file, and prints a line for each skipped byte. This reader
 needs only the content, and its time is bounded.

@@ -12,7 +12,7 @@ EARTH_M = 6_378_137.0
 """Equatorial radius of the earth, WGS 84 [m]."""
 METRES_MAX, DEGREES_MAX_M = 1e6, 1e5
 """Largest distance from the origin on each axis, for coordinates in metres and in degrees [m]. The
-latter is smaller because degrees are projected onto a plane."""
+limit for degrees is smaller because degrees are projected onto a plane."""
 Origin = tuple[float, ...]
 """Latitude and longitude of a scenario's origin [degrees], and, if known, its altitude above the
 sea [m]; empty if the origin is unknown."""
@@ -53,14 +53,15 @@ def coordinates(points: Any) -> Array:
         if not (isinstance(point, list) and len(point) in (2, 3)):
             raise ValueError(f"coordinates of two numbers, got {str(point)[:80]}")
         if any(number(each, "coordinates") for each in point[2:]):
-            raise ValueError("no heights in its coordinates: they are the properties low_m, high_m")
+            raise ValueError("no heights in its coordinates, but properties low_m and high_m")
     return np.array([[number(each, "coordinates") for each in point[:2]] for point in points])
 
 
 def local(degrees: Array, origin: Origin) -> Array:
     """Metres north and east of the origin, from longitude and latitude [degrees]; shape (n, 2).
 
-    A degree of longitude has its length at the mean of both latitudes, as in ArduPilot.
+    The length of a degree of longitude is taken at the mean of the point's and the origin's
+    latitude, as in ArduPilot.
 
     Raises:
         ValueError: a coordinate is out of range, or the origin is not known.

@@ -1,9 +1,9 @@
 """Logs of ping, fping and similar programs, in any language: round trips of packets.
 
 `_TABLE` lists the kinds of lines, and the function that handles each. Words are not interpreted,
-because ping prints them in the user's language: the line of a packet contains a number, and that of
-an answer also a round trip such as `=20.3 ms`; a packet without a round trip is lost. Windows
-prints no numbers: there each line between the first line and an empty line is a packet.
+because ping prints them in the user's language: the line of a packet contains a number, and the
+line of an answer also a round trip such as `=20.3 ms`; a packet without a round trip is lost.
+Windows prints no numbers: there each line between the first line and an empty line is a packet.
 
 A run is one call of ping. It ends with its summary, which also counts the packets sent after the
 last answer. A new run begins with ping's first line, with a number that is answered twice without
@@ -98,7 +98,7 @@ class Log:
     in_list: bool = False
     """Whether every line describes a packet, as in the output of Windows."""
     every_s: float | None = None
-    """Time between two packets, from the newest command line in the log [s]; None without one."""
+    """Time between two packets, from the log's newest command line [s]; None if it has none."""
 
     def begin(self, first: int | None, *, numbered: bool = True) -> Run:
         self.run = Run(first, numbered, every_s=self.every_s if numbered else None)
@@ -256,8 +256,8 @@ _TABLE: tuple[tuple[str, str, Callable[[Log, "re.Match[str]"], None]], ...] = (
     ("", r".", _other),
 )
 LINES = tuple((needle, re.compile(pattern), act) for needle, pattern, act in _TABLE)
-"""Kinds of lines: a substring for a quick check, a pattern, and a function for such lines. The
-first kind that matches a line applies. Every pattern takes linear time."""
+"""Kinds of lines: a substring for a quick check, a pattern, and a function that processes the line.
+The first kind that matches a line applies. Every pattern takes linear time."""
 _PACKET = re.compile(rf"\b(?:icmp_)?[sr]eq[= ]\d|: \[\d{{1,9}}\], |{_TIME}|^PING6?\b", re.MULTILINE)
 
 

@@ -196,7 +196,7 @@ def along(
 
 
 def _speed_key(kind: Any) -> str:
-    """Key of a plan's speed, by the MAV_TYPE of its vehicle; None: not given."""
+    """Key of a plan's speed, by the MAV_TYPE of the plan's vehicle; `kind` None: type not given."""
     if kind in MULTICOPTERS:
         return "hoverSpeed"
     if kind in ROVERS:

@@ -1,12 +1,13 @@
 """Recorded paths: files of measured delays, in one of several formats.
 
-- CSV with a line of names: a column of times, one of delays or round trips, and optionally `lost`
-(`_TIMES`, `_DELAYS`). `skytether probe` writes this format, with `time_s,delay_s,lost`.
+- CSV with a line of names: a column of times, a column of delays or round trips, and optionally
+`lost` (`_TIMES`, `_DELAYS`). `skytether probe` writes this format, with `time_s,delay_s,lost`.
 - Logs of ping and similar programs (`pings`).
 - The JSON that `irtt client -o` writes, gzipped or not.
 
 Each file is read as rows of a time and a delay, or NaN; `_checked` converts the rows to a path.
-Half of a round trip is used for each direction, and a packet without an answer is lost in both.
+Half of a round trip is used for each direction. A packet without an answer counts as lost in both
+directions.
 """
 
 import re
@@ -61,8 +62,8 @@ def recorded_in(file: File, way: Way = "auto") -> RecordedPath:
 
     Args:
         file: name and content of the file.
-        way: for a file of irtt, the delay from client to server (send) or back (receive), which
-            needs synchronised clocks; auto: half of the round trip.
+        way: delay to use from a file of irtt: from client to server (send) or back (receive), for
+            which irtt's two clocks must be synchronised, or half of the round trip (auto).
 
     Raises:
         ValueError: the file has no delays, or they contradict each other.
@@ -158,7 +159,7 @@ def _cell(word: str) -> float:
 
 
 def _wrong_cell(text: str, columns: Sequence[int], delimiter: str) -> str:
-    """Message for the first line without a number in a column that needs one."""
+    """Message for the first line without a number in a column that needs numbers."""
     for number, line in enumerate(StringIO(text), 1):
         cells = line.rstrip("\r\n").split(delimiter)
         if number == 1 or not line.strip():
@@ -205,7 +206,7 @@ def _of_csv(text: str) -> RecordedPath:
 
 
 def _unit_of_times(times: Array, name: str) -> float:
-    """Unit of the times in a column without a unit [s]; for times since 1970, by their size."""
+    """Unit of times without a stated unit [s]: by their size if since 1970, else by intervals."""
     largest = float(np.nanmax(times, initial=0.0))
     for least, unit in ((1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)):
         if largest >= least:
@@ -302,7 +303,7 @@ def _checked(
     copies: int = 0,
     begin_s: float = 0.0,
 ) -> RecordedPath:
-    """Path of rows, sorted by time.
+    """Recorded path of the given rows, sorted by time.
 
     Args:
         time_s: times of sending [s]; shape (n,).

@@ -37,7 +37,7 @@ class TableForm(NamedTuple):
     """Columns of a table, and the conversion of its coordinates to metres north, east and up."""
 
     columns: tuple[str, str, str, str]
-    """Time and three coordinates, the last for flights with three axes."""
+    """Names of the columns of time and three coordinates; with two axes the third is ignored."""
     tick_s: float
     """Unit of the time [s]."""
     place: Callable[[Array, Origin | None], Array]

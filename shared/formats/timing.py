@@ -1,4 +1,4 @@
-"""Times of tracks: on one clock for all vehicles of a file, or from a speed without such times."""
+"""Times of tracks: on one clock for all vehicles of a file, or computed from a speed."""
 
 import re
 from collections.abc import Iterable
@@ -43,7 +43,8 @@ def together(lines: Iterable[Line], speed_mps: float) -> Tracks:
     """Tracks of the vehicles of a file, numbered from 1 in the order of the file.
 
     All times count from the earliest of the file; a vehicle that begins later waits at its first
-    point. A line without times is followed at a speed. Of simultaneous points the first counts.
+    point. A line without times is followed at `speed_mps`. Of points of a vehicle at the same time
+    only the first is used.
 
     Raises:
         ValueError: there are too many points, or decreasing times.

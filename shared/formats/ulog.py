@@ -1,7 +1,7 @@
 """ULog of PX4 (`.ulg`): the track of one vehicle.
 
-Places are those of `vehicle_global_position`, with altitudes above the sea; home is the first
-`home_position`, or else the first place. In a log without global positions, places are those of
+Places are taken from `vehicle_global_position`, with altitudes above the sea; home is the first
+`home_position`, or else the first place. In a log without global positions, places are taken from
 `vehicle_local_position`, in metres from the estimator's start.
 """
 
@@ -20,8 +20,8 @@ from skytether.shared.law.model import Array
 
 GLOBAL, LOCAL, HOME = "vehicle_global_position", "vehicle_local_position", "home_position"
 READS_MAX, READS_LEAST, MESSAGE_BYTES = 4_000_000, 1000, 8
-"""Largest and smallest limit of the reads of a log, and size of the smallest message [B]. A message
-takes two reads. The limit ends pyulog's endless loop in some damaged logs."""
+"""Largest and smallest limit of the number of reads of a log, and size of the smallest message [B].
+A message takes two reads. The limit ends pyulog's endless loop in some damaged logs."""
 
 
 class _Content(io.BytesIO):

@@ -2,7 +2,8 @@
 
 Each line is an item: its index, whether it is the current one, frame, command, four parameters,
 latitude, longitude, altitude, and whether to continue automatically. Item 0 is home. Items are
-flown as those of a plan (`plans.along`), at `reference.speed_mps` until an item changes the speed.
+flown like the items of a plan (`plans.along`), at `reference.speed_mps` until an item changes the
+speed.
 """
 
 from typing import Any

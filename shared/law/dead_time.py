@@ -3,11 +3,13 @@
 θ = n Δt + r: n whole steps, and a remainder r shorter than a step. So two inputs act within a step:
 first, for the time r, the input of n + 1 steps ago, then the input of n steps ago:
 
-    x(k+1) = A x(k) + B u(k-n) + L (u(k-n-1) - u(k-n))          L = B - B(Δt - r)
+    x(k+1) = A x(k) + B u(k-n) + L (u(k-n-1) - u(k-n))
+
+where A and B belong to a step of length Δt, B' to a step of length Δt - r, and L = B - B'.
 
 Planning does not have to consider a dead time (Artstein's reduction). The vehicle knows the inputs
-that it has issued and that do not act yet. From them it predicts the state z in which its next
-input takes effect:
+that it has issued and that do not act yet. From these inputs the vehicle predicts the state z in
+which its next input takes effect:
 
     z(k) = x at k Δt + θ             z(k+1) = A z(k) + B u(k), which is eq. (4)
 
@@ -39,7 +41,7 @@ def dead_time(tau_s: float, dead_time_s: float, dt_ns: int, gain: float = 1.0) -
     steps, rest_ns = divmod(seconds_to_ns(dead_time_s), dt_ns)
     if not rest_ns:
         return DeadTime(steps, None, (0.0, 0.0))
-    # B is not linear in time, so B(Δt - r) is discretised separately, not as a share of B.
+    # B is not linear in time, so B' of the time Δt - r is discretised, not taken as a share of B.
     times_s = (dt_ns / SECOND_NS, (dt_ns - rest_ns) / SECOND_NS, rest_ns / SECOND_NS)
     whole, after, rest = (discretise([tau_s], time_s, gain).axes()[0] for time_s in times_s)
     return DeadTime(steps, rest, (whole.b0 - after.b0, whole.b1 - after.b1))

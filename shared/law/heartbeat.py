@@ -5,9 +5,10 @@ of the packets that arrive. So each packet of a session has a number, and carrie
 silence that its sender allows the receiver. Any packet counts as a heartbeat; an end with nothing
 else to send sends a heartbeat after that silence.
 
-With a packet every T, and n of them within the time-out, a working link is mistaken for lost
+If a packet is sent every T seconds, n packets within the time-out, and packets are lost
+independently with the probability p, then a working link is mistaken for lost
 
-    f = 3600/T pⁿ (1 - p) times an hour                      p: share lost, independent
+    f = 3600/T pⁿ (1 - p) times an hour.
 
 An end requests the longest T, a whole number of steps and within bounds, with f at most once in ten
 hours. A twentieth of the time-out is a margin for varying delays.
@@ -38,8 +39,8 @@ SESSION_NS = 30 * SECOND_NS
 RARE_TIMES = 2
 """Longest silence between a vehicle and a server that does not lead it, as a multiple of the
 time-out; bounded by SESSION_NS."""
-# At 30 % loss, no flight of `target` braked with the value 2. With 3, 5 of 30 flights braked,
-# because plans were made from observations that were too old.
+# At 30 % loss, no flight of `target` braked with the value 2. With the value 3, five of 30 flights
+# braked, because plans were made from observations that were too old.
 PATIENCE = 2
 """Server's time-out for a vehicle, as a multiple of the vehicle's own time-out."""
 
@@ -53,7 +54,7 @@ def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:
         loss: share of packets lost, independently.
     """
     n = int(TIMEOUT_SHARE * timeout_ns) // silence_ns
-    most = n / (n + 1)  # with more loss, the link would be lost less often, but for longer
+    most = n / (n + 1)  # with more loss, the link is mistaken for lost less often, but for longer
     loss = min(loss, most)
     return 3600 * SECOND_NS / silence_ns * loss**n * (1.0 - loss)
 
@@ -99,8 +100,8 @@ class Hearing:
         table = silences(timeout_ns, step_ns)
         self._losses, self._silences = [loss for loss, _ in table], [ns for _, ns in table]
         self._received = 0
-        """Bits of the newest WINDOW packets, set for those that arrived; the newest is the lowest
-        bit."""
+        """Bits of the newest WINDOW packets, each 1 if its packet arrived; the lowest bit belongs
+        to the newest packet."""
         self.newest = -1
         """Largest number of a packet that arrived; -1 before the first."""
         self._newest_at = BEFORE

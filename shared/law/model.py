@@ -9,7 +9,7 @@ system per axis, and the same code serves 2-D and 3-D:
     v(k+1) =        a11 v(k) + b1 u(k)               [0, a11]]        b1]
 
 `advance` is the only implementation of eq. (4). Its arguments are the numbers of one axis or the
-arrays of all axes. Every kernel that predicts a state compiles it in.
+arrays of all axes. It is compiled into every kernel that predicts a state.
 """
 
 from collections.abc import Sequence

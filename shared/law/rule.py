@@ -9,7 +9,7 @@ the horizon is longer. After the last input the vehicle repeats this input for e
 this input. Without compensation the vehicle flies the first input at all stages of the horizon.
 
 With feedback aboard the vehicle is controlled towards the reference state x̄ of these inputs, also
-after the last one:
+after the last input:
 
     u*(k) = u(k) + K (x̄(k) - x(k)),     x̄(i+1) = A x̄(i) + B (u(i) + ŵ)
 

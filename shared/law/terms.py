@@ -1,4 +1,4 @@
-"""Terms of a flight: the values on which server and client must agree before it.
+"""Terms of a flight: the values on which server and client must agree before the flight.
 
 Server and client compute predictions from terms only, so that both predict the same. A key of a
 scenario that is not a term belongs to one end, which may set it freely;
@@ -90,7 +90,7 @@ class Terms(NamedTuple):
 
     @property
     def planned(self) -> int:
-        """Number of a horizon's inputs after the committed ones: H, or 1 for a trajectory."""
+        """Number of a horizon's inputs after the committed inputs: H, or 1 for a trajectory."""
         return 1 if self.splines else self.horizon
 
     @property

@@ -94,7 +94,8 @@ def _no_goals(scenario: Scenario) -> Iterator[Contradiction]:
         return
     assert isinstance(flown, Mission)
     apart_m, clear_m = clearances(scenario).planned_apart_m, clearances(scenario).planned_clear_m
-    # Last goals of other vehicles. They are unknown here with `allocate`: the server assigns them.
+    # Last goals of the other vehicles; with `allocate` they are unknown here, because the server
+    # assigns goals to vehicles.
     others = () if mission.allocate else flown.vehicles
     ends = {each: flown.goals(each)[-1] for each in others if each not in goals}
     beside = " to the side" if lands(scenario) else ""

@@ -26,7 +26,7 @@ def lands(scenario: Scenario) -> bool:
 
 
 def rest_scale(scenario: Scenario) -> float:
-    """Factor on vertical distances of resting vehicles. 0: they may land, heights do not count."""
+    """Factor on vertical distances of resting vehicles; 0 if vehicles may land past each other."""
     return 0.0 if lands(scenario) else scenario.section(MissionConfig).height_scale
 
 

@@ -1,4 +1,4 @@
-"""Events of a mission's vehicles, reported by the server that plans it."""
+"""Events of a mission's vehicles, reported by the server that plans the mission."""
 
 from skytether.shared.events.flight import VehicleEvent
 

@@ -27,11 +27,12 @@ TINY_MPS = 1e-6
 PLACES_AT_ONCE = 1_000_000
 """Number of positions of a show that are compared at once; the bound limits memory."""
 CROWDED = 32
-"""Number of simultaneous stays in neighbouring cells; if there are more, two must be too near."""
+"""Number of simultaneous stays in neighbouring cells above which two of them must be too near to
+each other."""
 
 
 class Mission(OfFleet):
-    """Timed goals of all vehicles, and the reference of one of them.
+    """Timed goals of all vehicles, and the reference of one vehicle.
 
     A vehicle starts at its first goal. A vehicle without goals stays at the origin.
 
@@ -217,7 +218,7 @@ class _Stays(NamedTuple):
         Each iteration compares all stays with their next candidates and keeps the earliest pair.
 
         Args:
-            stays: stays to compare with later ones; shape (m,).
+            stays: stays to compare with later stays; shape (m,).
             first: index in `others` of the first candidate; shape (m,).
             behind: index in `others` after the last candidate; shape (m,).
             others: stays sorted by cell and time; shape (n,).
@@ -322,7 +323,7 @@ class Guided:
 
     Args:
         references: gives the reference of a vehicle by its number.
-        goals: goals that replace those of the mission [m; shape (axes,)], by vehicle.
+        goals: goals that replace the mission's goals [m; shape (axes,)], by vehicle.
         most: largest number of vehicles whose references are cached.
     """
 

@@ -97,7 +97,9 @@ def corridor(width: float, *middle: float) -> list[Zone]:
     way = np.diff(points, axis=0)
     long = np.linalg.norm(way, axis=1, keepdims=True)
     if width <= 0.0 or (long < 1e-6).any():
-        raise ValueError("corridor(width, x, y, x, y, …): a width, and no point twice in a row")
+        raise ValueError(
+            "corridor(width, x, y, x, y, …) with a width above 0, and successive points that differ"
+        )
     across = np.stack([-way[:, 1], way[:, 0]], axis=1) / long
     # Mitre joints: the edges of two successive segments meet on the bisector of their angle.
     ends = np.concatenate([across[:1], across[:-1] + across[1:], across[-1:]])

@@ -96,7 +96,7 @@ class Zones:
         return ""
 
     def planes(self, points: Array, reach_m: Array) -> Planes:
-        """Half-planes between points and the zones near them.
+        """Half-planes between points and the zones near these points.
 
         Args:
             points: positions with positive clearance [m]; shape (n, axes).

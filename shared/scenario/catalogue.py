@@ -44,7 +44,7 @@ TERMS: Mapping[str, str] = MappingProxyType(
 DECISIONS: Mapping[str, object] = MappingProxyType(
     {name: attrgetter(name)(Scenario()) for name, key in KEYS.items() if key.is_decision}
 )
-"""Keys that an operator sets in flight only, with their values until then."""
+"""Keys that an operator sets only in flight, with the values that they have before."""
 
 
 def keys_of(*groups: str) -> frozenset[str]:
