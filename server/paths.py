@@ -51,7 +51,7 @@ class ServerPaths:
     """Paths of one session.
 
     A path is used once its address is proven: the server sends a number to the address, and the
-    vehicle returns the number from there. An attacker elsewhere who copies packets cannot do so.
+    vehicle returns it from that address. An attacker elsewhere who copies packets cannot do so.
     The number is computed from the address and a secret, like a cookie, so no request is stored.
 
     An attacker who forwards copies in both directions can prove an address of its own. So the
@@ -60,7 +60,7 @@ class ServerPaths:
 
     Args:
         spread: `link.spread`.
-        entropy: returns this many random bytes.
+        entropy: function that returns a number of random bytes.
         timeout_ns: time without a packet after which the vehicle considers the link lost [ns].
     """
 
@@ -83,7 +83,7 @@ class ServerPaths:
         return next((path for path, places in self._places.items() if place in places), None)
 
     def hear(self, place: Place, now_ns: int) -> int | None:
-        """Note that a datagram has arrived from an address; returns the path's `number`."""
+        """Note that a datagram has arrived from an address; return the path as `number` does."""
         path = self.number(place)
         if path is not None:
             self._places[path][place] = now_ns
@@ -186,7 +186,7 @@ class RoutesOverPaths(Routes):
     """Routes to vehicles with one or several paths.
 
     Args:
-        entropy: returns this many random bytes.
+        entropy: function that returns a number of random bytes.
         spread: `link.spread`.
         timeout_ns: time without a packet after which a vehicle considers the link lost [ns].
     """

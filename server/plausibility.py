@@ -63,7 +63,7 @@ class Belief(IntEnum):
 
 
 LAST, DOUBTED, NEW = 0, 1, 2
-"""Index of a vehicle's observations: last accepted, last rejected, and new."""
+"""Indices of a vehicle's three observations: last accepted, last rejected, and new."""
 
 
 class HeardNumbers(NamedTuple):

@@ -35,7 +35,7 @@ class Routes:
         """Routes to vehicles with one or several paths, which replace these routes.
 
         Args:
-            entropy: returns this many random bytes.
+            entropy: function that returns a number of random bytes.
             spread: `link.spread`.
             timeout_ns: time without a packet after which a vehicle considers the link lost [ns].
         """

@@ -1,8 +1,8 @@
 """The server's side of secured links: keys, handshakes and channels of the vehicles.
 
 A HELLO is answered in two steps. Without a valid cookie for the sender's address, the server
-answers with a CHALLENGE that contains one, and stores nothing. With the cookie, it answers with a
-RESPONSE that contains the WELCOME and opens a new channel. This channel is pending until the
+answers with a CHALLENGE that contains a cookie, and stores nothing. With the cookie, it answers
+with a RESPONSE that contains the WELCOME and opens a new channel. This channel is pending until the
 vehicle's first packet in it, and only then replaces the live channel. So an attacker who replays a
 recorded HELLO cannot end a flight.
 """

@@ -43,7 +43,7 @@ class Session:
     number: int
     """Number of the session, contained in every message."""
     boot_id: int
-    """Number of this run of the client."""
+    """Number of this run of the client, chosen by the client."""
     home: Address
     """Source address of the newest HELLO; a cookie has proven that the client receives there."""
     address: Address
@@ -76,7 +76,7 @@ class Session:
     route: Route | None = None
     """Route to the vehicle over several paths; None if it has only one address."""
     lead: Any = None
-    """The vehicle's reports of its leader (`SessionLead`); None if this is its only server."""
+    """The vehicle's reports of its leader (`SessionLead`); None if it has only this server."""
 
     def number_next(self, now_ns: int) -> int:
         number = self.sent
@@ -115,9 +115,9 @@ class Sessions:
     """Sessions of one run of the server.
 
     Args:
-        entropy: returns this many random bytes, for the numbers of sessions.
+        entropy: function that returns a number of random bytes, for the numbers of sessions.
         silence_ns: time after which a silent vehicle may count as gone [ns].
-        hearing: makes a `Hearing` for each session.
+        hearing: function that makes the `Hearing` of a session.
         assignment: chooses the vehicles that the server plans for.
         keeps_rows: whether a row stays reserved for its vehicle after its session, as on a mission,
             where the other vehicles avoid a silent vehicle.

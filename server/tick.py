@@ -39,7 +39,7 @@ class Grid:
         self._dt_ns = dt_ns
         self._events = events
         self.due_ns: int | None = None
-        """Time of the next tick; None while there is no vehicle to plan for."""
+        """Time of the next tick [ns]; None while there is no vehicle to plan for."""
         self.missed = 0
         self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)
         self.degraded = False

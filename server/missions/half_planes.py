@@ -37,7 +37,7 @@ class HalfPlanes(NamedTuple):
     bound: F1
     """Right-hand side of normal · p ≥ bound [m]; shape (n,)."""
     other: I1
-    """Index of the motion to keep away from; shape (n,)."""
+    """Index of the possible motion that each constraint keeps away from; shape (n,)."""
 
     def from_some(self, chosen: Flags) -> "HalfPlanes":
         """Half-planes of the motions whose flag in `chosen` is True; `chosen`: shape (motions,)."""

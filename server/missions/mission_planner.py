@@ -15,8 +15,8 @@ A new motion is sent only if at all times it keeps the distance
     D = separation_m + 2 tube_m
 
 from all motions that all other vehicles may fly, at every position that the errors of their clocks
-allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); the others
-keep more distance from a vehicle observed outside its tube. Motions sent earlier keep D already. So
+allow. `tube_m` is the largest distance of a vehicle from its motion (wind, tracking); vehicles keep
+more distance from a vehicle observed outside its tube. Motions sent earlier already keep D. So
 whichever packets are lost or late, and whichever motions are accepted, vehicles are `separation_m`
 apart if each stays in its tube (theorem: docs/together-proof.md). The distance from zones is
 `tube_m`. A vehicle can always stay on its motion in force: this needs no packet.
@@ -76,7 +76,7 @@ AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 OUT_M, OUT_STEPS = 0.1, 500
 """Distance between candidate positions on the way out [m], and their number."""
 NEARER_M = 1e-3
-"""Distance by which a vehicle that leaves a zone may approach it: a tolerance [m]."""
+"""Tolerance: distance by which a vehicle that leaves a zone may come nearer to the zone [m]."""
 ZONE = "a zone"
 CLOCK_POINTS = 33
 """Number of steps, within the error of a vehicle's step number, at which `_clock_m` evaluates its
@@ -110,7 +110,7 @@ class MissionPlanner(SplineScheme):
         apart = self._clearances = clearances(scenario)
         self._dt_s = terms.dt_s
         self._resend_after = terms.age_max // 3
-        """Age at which a motion is sent again, before it is too old to be flown [steps]."""
+        """Age at which a motion is sent again, so that it never is too old to be flown [steps]."""
         self._qp = TrajectoryQP(terms, mission.acceleration_mps2, mission.speed_mps)
         self._zones, self._lands = zones(scenario), lands(scenario)
         self._waypoints = Waypoints(
@@ -126,11 +126,11 @@ class MissionPlanner(SplineScheme):
         """Vehicles whose latest motion is repeated at this step."""
         self._scale = state.possible.metric.scale.copy()
         self._scale[ALTITUDE:] = rest_scale(scenario)
-        """Factors of the coordinates in distances between vehicles at rest; shape (axes,)."""
+        """Factor on each coordinate in distances between vehicles at rest; shape (axes,)."""
 
     def fleet_figures(self) -> dict[str, Any]:
-        """Margins of the theorem's conditions (docs/together-proof.md), each as a share: 1 is the
-        bound.
+        """Largest values of the quantities that the theorem bounds (docs/together-proof.md), each
+        divided by its bound.
         """
         return {"margins": dict(self._state.margins)}
 
@@ -219,7 +219,8 @@ class MissionPlanner(SplineScheme):
     def _objection(self, zones: Zones) -> str:
         """Reason why these zones are refused; empty if they are accepted.
 
-        A server that leads no vehicle accepts all zones; the leader knows all motions, and checks.
+        A server that leads no vehicle accepts all zones, because the leader knows all motions and
+        checks the zones.
         """
         if self.is_standby:
             return ""
@@ -505,7 +506,7 @@ class MissionPlanner(SplineScheme):
         )
 
     def _limiting_constraint(self, solved: tuple[Array, Array], planes: HalfPlanes) -> str:
-        """Name of the vehicle or zone that limits a motion most; empty if none does."""
+        """Name of the vehicle or zone that limits a motion most; empty if nothing limits it."""
         position = self._qp.at_times(*solved)
         spare_m = np.einsum("ij,ij->i", planes.normal, position[planes.time]) - planes.bound
         binding = planes.other[spare_m < BINDS_M]
@@ -519,7 +520,7 @@ class MissionPlanner(SplineScheme):
 
     def _conflicts(self, row: int, motion: Motion, planned: PossibleMotion) -> Flags:
         """Flags of the motions that `motion` comes too near to; the last flag is for zones.
-        `planned`: the same motion in common steps.
+        `planned`: the same motion in steps of the common time grid.
         """
         vehicle = self._state.vehicles[row]
         assert vehicle.in_force is not None
@@ -537,8 +538,8 @@ class MissionPlanner(SplineScheme):
         return conflicts
 
     def _enters_zone(self, points: Array) -> bool:
-        """Whether a polyline comes too near to a zone; it may lead away from a zone that is too
-        near at its start.
+        """Whether a polyline comes too near to a zone. A polyline may lead away from a zone that is
+        too near at its start.
         """
         clearance_m = self._clearances.tube_m + self._clearances.bend_m
         if not comes_near(self._zones, points, clearance_m):

@@ -36,12 +36,12 @@ RESTART_STEPS = 20
 PLANNED = np.arange(1.0, INTERVALS + 1.0)
 """Numbers n of a motion's planned knots."""
 PLAN_DUE, REPEAT_DUE = 1, 2
-"""Flags in `MissionState.due`: at this step a motion may be planned for the vehicle; or its latest
-motion is sent again."""
+"""Flags in `MissionState.due`: a motion may be planned for the vehicle at this step, and the
+vehicle's latest motion is sent again at this step."""
 
 
 class VehicleRows(NamedTuple):
-    """Data of all rows; each of shape (capacity,)."""
+    """Data of all vehicles, by row; each array has the shape (capacity,)."""
 
     ahead: I1
     """Step of the vehicle by the server's count, minus the step of the common time grid."""
@@ -57,7 +57,7 @@ class VehicleRows(NamedTuple):
     unknown_until: I1
     """Last step at which the vehicle may fly a motion of another server; -1 if none."""
     sent_step: I1
-    """Step of the latest motion sent if it is not acknowledged; 0 if there is none."""
+    """Step of the latest motion sent, if this motion is not yet acknowledged; otherwise 0."""
     repeats_for: I1
     """Number of steps for which the latest motion is repeated, see `VehicleMotions.repeats`."""
     early: F1
@@ -174,7 +174,7 @@ class MissionState:
         """Note which server leads a vehicle.
 
         If this server begins to lead the vehicle, `lead` contains the motion in force. The vehicle
-        drops plans with earlier leadership numbers, so it can fly no other motion.
+        drops plans with earlier leadership numbers, so the vehicle can fly no other motion.
         """
         if self.led_vehicles.follow(row, lead):
             assert lead is not None
@@ -360,7 +360,7 @@ class MissionState:
         return vehicle.speed_mps * (self._tau_s + vehicle.speed_mps / self._braking)
 
     def _place(self, row: int, observed: Array) -> Array:
-        """Resting position of a vehicle without a motion: its start if near, else `observed`."""
+        """Resting position of a vehicle without a motion: its start if nearby, else `observed`."""
         number = self.number_of(row)
         if number not in self.absent:
             return observed

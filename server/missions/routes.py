@@ -89,8 +89,8 @@ class Graph:
             far = np.where(longer, far[:, [via]] + far[[via]], far)
             after = np.where(longer, after[:, [via]], after)
         self._far, self._after = far, after
-        """Length of the shortest path from one node to another [m], infinite without a path, and
-        the next node on it."""
+        """Length of the shortest path from each node to each other node [m], infinite if there is
+        none, and the next node on this path."""
 
     def corners(self, place: Array, goal: Array) -> Array:
         """Corners of the shortest path between two positions; empty without a path or corners."""

@@ -41,7 +41,7 @@ class Pair(NamedTuple):
 
 
 class Span(NamedTuple):
-    """Time interval in which a motion is compared with another."""
+    """Time interval in which a motion is compared with another motion."""
 
     begin: float
     end: float
@@ -64,7 +64,7 @@ def too_near(
     distance_m: float,
 ) -> Flags:
     """Flags of the possible motions to which a planned motion may come too near; shape
-    (possible.count + 1,), with False in the last, which is for zones.
+    (possible.count + 1,). The last flag is for zones; here it is False.
 
     Args:
         in_force: motion in force of the same vehicle. If it is too near already (by more than the
@@ -258,8 +258,8 @@ def _least_distance_within(
                 p01 = _difference(pair, span.begin, next_shift, x)
                 p11 = _difference(pair, span.end, next_shift, x)
             if x == ALTITUDE:
-                # A vehicle that may pass the other's height in this interval may do so at any
-                # time in it.
+                # A vehicle that may pass the other's height in this interval may pass it at any
+                # time of the interval.
                 high, low = max(p00, p10, p01, p11), min(p00, p10, p01, p11)
                 if (span.descends and high > 0.0) or (span.other_descends and low < 0.0):
                     p00, p10, p01, p11 = 0.0, 0.0, 0.0, 0.0

@@ -27,7 +27,7 @@ from skytether.shared.law.motion import INTERVALS, SPACING, speed_bounds
 from skytether.shared.law.terms import Terms
 
 TIMES_PER_INTERVAL = 2
-"""Number of times per interval at which distances are kept."""
+"""Number of times in each interval between two knots at which distances are constrained."""
 ACCELERATION_WEIGHT = 0.05
 """Weight r of accelerations [s⁴]."""
 LAST_WEIGHT = 5.0
@@ -73,20 +73,20 @@ class TrajectoryQP:
         self._until_knot_s = T * np.arange(1.0, n + 1.0)[:, None]
         to_position = _positions(np.arange(1.0, n + 1.0), place, T)
         self.times: Array = np.arange(n * TIMES_PER_INTERVAL + 1) / TIMES_PER_INTERVAL
-        """Times at which distances are kept, from the planned part's beginning [intervals]."""
+        """Times at which distances are constrained, from the planned part's start [intervals]."""
         self._after_s = self.times[:, None] * T
         self._to_sample = _positions(self.times, place, T)
-        """Matrix from accelerations to positions at `times` [s²]; shape (times, N)."""
+        """Matrix that maps accelerations to positions at `times` [s²]; shape (times, N)."""
         weights = np.ones(n)
         weights[-1] = LAST_WEIGHT
         self._to_gradient = to_position.T * weights
-        """Matrix from offsets from the targets to the QP's linear term [s²]; shape (N, N)."""
+        """Matrix that maps offsets from the targets to the QP's linear term [s²]; shape (N, N)."""
         one = self._to_gradient @ to_position
         hessian = np.kron(np.eye(axes), one + ACCELERATION_WEIGHT * np.eye(n))
         self._hessian = hessian.astype(np.float64)
         # Inputs v + τ a at the end and at the beginning of each interval.
         self._to_velocity = T * np.tril(np.ones((n, n)))
-        """Matrix from accelerations to velocities at the knots [s]; shape (N, N)."""
+        """Matrix that maps accelerations to velocities at the knots [s]; shape (N, N)."""
         to_velocity = np.kron(np.eye(axes), self._to_velocity)
         before = np.kron(np.eye(axes), T * np.tril(np.ones((n, n)), -1))
         lag = np.diag(np.repeat(tau_s, n))
@@ -94,7 +94,7 @@ class TrajectoryQP:
         """Matrix A without half-planes; shape (axes + 2 axes N, axes N)."""
         moves = np.kron(np.eye(axes), np.ones((n, 1)))
         self._to_bounds = -np.vstack([0.0 * moves, np.eye(axes), moves, moves])
-        """Change of the bounds per initial velocity; shape (axes + 3 axes N, axes)."""
+        """Matrix that maps the initial velocity to the bounds; shape (axes + 3 axes N, axes)."""
         a_max, u = np.full(n * axes, acceleration_mps2), np.repeat(most, n)
         self._upper = np.concatenate([a_max, np.zeros(axes), u, u])
         self._sense = np.where(self._upper == 0.0, EQUALITY, 0).astype(np.int32)
@@ -120,7 +120,7 @@ class TrajectoryQP:
         if result != SOLVED:
             return None
         velocity = np.concatenate([kept_v, kept_v[-1] + self._to_velocity @ x.reshape(axes, -1).T])
-        # A motion has to end at rest; in the solution it does so only within a tolerance.
+        # A motion has to end at rest; the solution ends at rest only within a tolerance.
         velocity[-1] = 0.0
         # Positions are computed from the velocities, so that both agree exactly.
         twice = velocity[kept:] + velocity[kept - 1 : -1]
@@ -147,7 +147,7 @@ class TrajectoryQP:
         return MotionProblem(self._hessian, linear, rows, upper, lower, sense)
 
     def at_times(self, position: Array, velocity: Array) -> Array:
-        """Positions at `times` of knots returned by `solve` [m]; shape (times, axes)."""
+        """Positions at `times` of a motion with knots from `solve` [m]; shape (times, axes)."""
         position, velocity = position[-INTERVALS - 1 :], velocity[-INTERVALS - 1 :]
         accelerations = np.diff(velocity, axis=0) / self._T
         drifting = position[0] + self.times[:, None] * self._T * velocity[0]
@@ -156,7 +156,7 @@ class TrajectoryQP:
 
 
 def _positions(times: Array, place: Indices, T: float) -> Array:
-    """Matrix from accelerations to positions at `times` [intervals]; shape (times, n), [s²]."""
+    """Matrix [s²] that maps accelerations to positions at `times` [intervals]; shape (times, n)."""
     into = np.clip(times[:, None] - place, 0.0, None)
     inside = np.minimum(into, 1.0)
     moved: Array = T * T * (0.5 * inside**2 + inside * (into - inside))

@@ -110,7 +110,7 @@ class VehicleMotions:
 
     @property
     def repeats(self) -> tuple[int, int]:
-        """Step of the latest motion sent, and number of steps in which it is repeated; or 0, 0."""
+        """Step of the latest motion, and number of steps in which it is repeated; 0, 0 if none."""
         if not self.sent:
             return 0, 0
         return self.sent[-1].step, (self.copies - 1) * COPY_STEPS

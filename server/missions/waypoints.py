@@ -1,5 +1,5 @@
-"""Waypoint selection: a vehicle's goal, a point on its route around zones, or a point to the right
-of this route.
+"""Waypoint selection: a waypoint is the vehicle's goal, a point on its route around zones, or a
+point to the right of this route.
 
 A stuck vehicle also flies around resting vehicles for a while. Its waypoints turn further and
 further to the right, finally to random directions, so that vehicles that meet can pass.
@@ -17,12 +17,12 @@ from skytether.shared.missions.zones import Zone, Zones
 WAYPOINT_M = 3.0
 """Largest distance of a waypoint that is not on the route [m]."""
 AHEAD_M = 1.5
-"""Distance along a route around zones to the waypoint on it [m]."""
+"""Distance of a waypoint on a route around zones from the vehicle, along this route [m]."""
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 """Angles by which waypoints of a stuck vehicle turn to the right [rad]: step, largest angle before
 random directions, and step back when the vehicle moves."""
 DETOUR_M, DETOUR_S = 5.0, 20.0
-"""Range in which a stuck vehicle avoids resting vehicles [m], and time for which it does [s]."""
+"""Range in which a stuck vehicle avoids resting vehicles [m], and duration of this [s]."""
 CLOSED_M = 0.6
 """Distance ahead of a vehicle at which its route is closed [m]; three tubes if that is more."""
 AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
@@ -68,7 +68,7 @@ class Waypoints:
 
         Args:
             place: position at the beginning of the plan [m]; shape (axes,).
-            resting_places: returns the positions of the other vehicles at rest [m].
+            resting_places: function that returns the positions of other vehicles at rest [m].
         """
         way = self._ways_of(vehicle, k).way(place, goal)
         if not vehicle.turned_rad:

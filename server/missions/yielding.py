@@ -27,7 +27,7 @@ FURTHER = (1.2, 1.8, 2.7, 4.0)
 distance to keep between vehicles."""
 
 NO_NEARER_M = 1e-4
-"""Distance by which a vehicle that is too near may still come nearer: a tolerance [m]."""
+"""Tolerance: distance by which a vehicle that is too near may still come nearer [m]."""
 
 
 class Yielding(NamedTuple):
@@ -36,7 +36,7 @@ class Yielding(NamedTuple):
     asker: int
     """Row of the vehicle that asked, and gets the right of way."""
     until: int
-    """Common step at which the vehicle flies back, even if the other has not passed."""
+    """Step of the common time grid at which the vehicle flies back even if it was not passed."""
 
 
 def first_on(way: Array, places: Array, apart_m: float) -> int | None:

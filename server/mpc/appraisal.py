@@ -1,4 +1,4 @@
-"""Values of each plan that are set before its QP is solved, and its costs afterwards."""
+"""Appraisal of plans: values set before a plan's QP is solved, and the plan's costs afterwards."""
 
 from typing import NamedTuple
 
@@ -124,8 +124,8 @@ def _add_gap(
     """
     for stage in range(len(change)):
         # The slope is nonzero only at an active bound, where every allowed change increases the
-        # cost: a negative product is a rounding error. Without this term the gap was wrong in 68 %
-        # of the tests of a flight in wind 0.3.
+        # cost, so a negative product is a rounding error. Without the slope the cost gap was wrong
+        # at 68 % of the steps of a flight in wind 0.3.
         change[stage] = held[stage] - u[stage]
         cost += 2.0 * max(0.0, steep[stage] * change[stage])
     return add_cost(mpc, axis, x, change, cost)

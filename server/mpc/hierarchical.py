@@ -62,7 +62,7 @@ class PlanBatch(NamedTuple):
     terminal_weight: F1
     """Terminal weight P on position and velocity; shape (2,)."""
     compares: bool
-    """Whether plans are compared with the inputs sent before; only some schemes know these."""
+    """Whether plans are compared with the inputs sent before (known to some schemes only)."""
     memory: PlanMemory
     draft: Draft
     desired: Window

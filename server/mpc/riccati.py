@@ -6,10 +6,11 @@ A condensed QP  ½ Uᵀ𝓗U + gᵀU  with 𝓗 = ΓᵀWΓ + diag(ρ) is the opt
 
 So for a fixed set of inputs at their bounds, a backward pass over 2 x 2 matrices solves it in O(H),
 where a factorisation of 𝓗 takes O(H³). The forward pass gives the unconstrained input v of each
-stage: a stage belongs to the set if v is beyond the bound. A set that reproduces itself is optimal.
-From the shifted previous plan, one or two iterations suffice. If the sets repeat in a cycle (long
-steps, a tiny R, corners of the reference), each further iteration changes only the input with the
-largest violation. `server.mpc.exact` solves the QPs for which this does not converge.
+stage: a stage belongs to the set if v is beyond the bound. If a pass leaves the set unchanged, the
+set is optimal. From the shifted previous plan, one or two iterations suffice. If the sets repeat in
+a cycle (long steps, a tiny R, corners of the reference), each further iteration changes only the
+input with the largest violation. `server.mpc.exact` solves the QPs for which this method does not
+converge.
 """
 
 from typing import NamedTuple

@@ -31,7 +31,7 @@ from skytether.shared.wire.protocol import ahead_max
 PAGE = 128
 """Number of steps of a desired trajectory in a page."""
 PAGES = 256
-"""Number of slots for pages; a block of vehicles needs fewer at once."""
+"""Number of slots for pages; a block of vehicles needs fewer pages at once."""
 EMPTY = -1
 """Key of an empty slot."""
 FOUND = -1

@@ -283,8 +283,8 @@ class Scheme(ABC):
 
         Args:
             batch: vehicles and plans.
-            header: makes the header of a packet to the vehicle in a row. Each call uses up a packet
-                number, so it is called once per packet.
+            header: function that makes the header of a packet to the vehicle in a row. It is called
+                once per packet, because each call uses up a packet number.
         """
 
     @abstractmethod

@@ -202,7 +202,7 @@ def _foresee(
             state, law = memory.state[row, axis], settings.laws[axis]
             x = (state.p, state.v, state.u, speed)
             fly_schedule(settings, memory, row, axis, schedule, legs, k + d + H, x, track)
-            # With a wrong clock offset the observation may be later than k: it is used unchanged.
+            # With a wrong clock offset the observation may be later than k, and is used unchanged.
             now, start = k - observed, k + d - observed
             for j in range(2):
                 foresight.estimate[i, axis, j] = track.states[max(now, 0), j]

@@ -1,4 +1,4 @@
-"""Fitting a spline to a trajectory with the fewest knots that keep its error within a bound."""
+"""Fit of a spline to a trajectory, with the fewest knots for which the error is within a bound."""
 
 import numpy as np
 

@@ -38,8 +38,8 @@ from skytether.shared.wire.protocol import (
 )
 
 APART_NS = 250_000_000
-"""Longest time between two observations that update the disturbance [ns]. The inputs flown in
-between are interpolated from the first and the last, which is too coarse over longer times."""
+"""Longest time between two observations that update the disturbance [ns]. The inputs flown between
+the observations are interpolated, which is too coarse over longer times."""
 
 
 class EstimatorSettings(NamedTuple):

@@ -5,7 +5,7 @@ The schedule is made from the horizons in force and in flight, and flown by the 
 
     x(i+1) = A x(i) + B (u(i) + w)
 
-The scheme "committed", its disturbance observer and its loss scenarios use it.
+The scheme "committed", its disturbance observer and its loss scenarios use this replay.
 """
 
 from typing import NamedTuple
@@ -48,7 +48,7 @@ def make_schedule(
 
     Args:
         in_force: number of the horizon in force at `begin`.
-        following: numbers of the later horizons, each in force from the step it is due.
+        following: numbers of later horizons, each in force from the step at which it is due.
     """
     ring, legs = sent.plans.shape[1], 1
     schedule.begins[0], schedule.numbers[0] = begin, in_force

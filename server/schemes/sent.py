@@ -101,7 +101,7 @@ def update_delay_and_loss(sent: Sent, clock: Seen, row: int) -> int:
     lost.
     """
     delivery, bound, observed = sent.delivery[row], sent.bound, sent.observed[row]
-    # No sample yet: half a round trip, rounded up, plus a margin.
+    # Before the first sample the bound is half a round trip, rounded up, plus a margin.
     if bound.steps[row] == 0:
         set_first(bound, row, -(-half_trip_ns(clock, row) // sent.dt_ns) + MARGIN)
     raise_to(bound, row, -(-shortest_ns(clock, row) // sent.dt_ns))
@@ -139,7 +139,7 @@ def oldest(sent: Sent, row: int) -> int:
 
 @part
 def number_of(sent: Sent, row: int, made_for: int) -> int:
-    """Number of the plan made for a step; HOVERS for a negative step, UNKNOWN if not stored."""
+    """Number of the plan made for a step; HOVERS if the step is negative, UNKNOWN if not stored."""
     if made_for < 0:
         return HOVERS
     # Search from the newest plan backwards: the plan in force is usually one of the last few.

@@ -28,8 +28,8 @@ summed over the axes, with the expectation over these cases, the weight Q_p on t
 and h = (1 + K_v) / K_p, with which the regulator weighs velocity: K_p (Δp + h Δv) is the change of
 its input. The gap is averaged over the steps k + d, when a packet sent now is in force at the
 latest; k + 2 d, when the server knows whether it arrived; and k + 3 d, when a packet sent then
-would be in force. With k + d alone, an ending trajectory was replaced too late if a packet was
-lost. A vehicle without any received trajectory hovers at its observed position.
+would be in force. When only the step k + d was used, an ending trajectory was replaced too late if
+a packet was lost. A vehicle that has received no trajectory hovers at its observed position.
 """
 
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -425,8 +425,8 @@ def _appraise(
         if not plan.fresh:
             newest = _newest(sent, row, first)
             plan.cost_gap, plan.deviation_m = _gap(settings, memory, intended[i], row, newest, k, d)
-        # The trajectory in force ends soon; if the loss of all later trajectories is likely enough,
-        # a new one is sent, or the vehicle would brake.
+        # If the trajectory in force ends soon and all trajectories in flight may be lost, a new
+        # trajectory is sent, so that the vehicle does not brake.
         soon = in_force_ends <= k + COMPARED * d <= observed + settings.age_max
         plan.fresh |= soon and share > RUNS_OUT
 

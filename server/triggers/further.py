@@ -57,8 +57,8 @@ class SendOnDelta(Trigger):
 
 @trigger(name="self_triggered")
 class SelfTriggered(Trigger):
-    """Sends when the reference, at its velocity at the last packet, would have moved by a number of
-    metres since then, and after a number of seconds at the latest.
+    """Sends when the reference, extrapolated at its velocity at the last packet, has moved by a
+    number of metres since that packet, and after a number of seconds at the latest.
 
     Source: Velasco, Fuertes, Marti, The self triggered task model for real-time control systems,
     RTSS (2003).
@@ -88,7 +88,7 @@ class SelfTriggered(Trigger):
 
 @trigger(name="budget")
 class Budget(Trigger):
-    """Sends while it has a token; joined by & it is a hard limit on the packet rate.
+    """Sends while a vehicle has a token; joined by &, this is a hard limit on the packet rate.
 
     A token bucket: b ← min(b + g, burst) at every step, b ← b - 1 with a packet, and no packet if
     b < 1. So T seconds have at most burst + packets_per_s · T packets. If another policy, joined by

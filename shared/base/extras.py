@@ -52,7 +52,7 @@ def need(extra: str) -> None:
 
 
 def _extras() -> dict[str, list[str]]:
-    """Modules of each extra; their names are the packages' names, except for MODULES."""
+    """Modules of each extra. A module has the name of its package, except for those in MODULES."""
     from importlib import metadata  # this import takes a tenth of the client's start-up time
 
     extras: dict[str, list[str]] = {}

@@ -1,4 +1,4 @@
-"""Files that a command writes, without destroying others; `input_files` reads them.
+"""Files that a command writes, without destroying other files; `input_files` reads files.
 
 Everything that a command writes is a plain file: a device, a pipe or a link in its place is
 refused. Otherwise `--out /dev/sda`, or a link made by another user, would redirect the output.
@@ -10,7 +10,7 @@ file has that name.
 - No command writes a file that it reads, and no two commands write the same file (`apart`,
 `claim`).
 
-No other module of the package opens a file for writing; tests/whole/test_writes.py checks it.
+No other module of the package opens a file for writing, as tests/whole/test_writes.py checks.
 """
 
 import os

@@ -406,7 +406,7 @@ def _dependencies(function: Callable[..., Any]) -> list[Callable[..., Any]]:
 def _source(function: Callable[..., Any]) -> str:
     """Source lines of a function, from its first decorator to its last instruction.
 
-    `inspect.getsource` uses a tokenizer to find the end, which took 0.1 s of each start.
+    `inspect.getsource` would find the end with a tokenizer, and take 0.1 s at each start.
     """
     code = function.__code__
     end = max(line or 0 for _, line, _, _ in code.co_positions())

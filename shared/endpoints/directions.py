@@ -5,5 +5,5 @@ the opposite, so netem names directions by the ends, see `other_directions`.
 """
 
 Directions = tuple[str, str]
-"""Names of two directions: to the vehicle or another program, and from the vehicle or program."""
+"""Names of two directions: towards the vehicle or another program, and away from it."""
 FLIGHT: Directions = ("uplink", "downlink")

@@ -207,7 +207,7 @@ class Endpoint(ABC):
         """Datagrams to be sent; each is returned once."""
         if not self._out:
             return []
-        # Copied and cleared, not replaced, because the parts of an endpoint share this list.
+        # The list is copied and cleared, not replaced, because an endpoint's parts share it.
         out = self._out.copy()
         self._out.clear()
         return out

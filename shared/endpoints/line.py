@@ -21,7 +21,7 @@ LINE: Address = ("line", 0)
 CLIENT, SERVER = "client", "server"
 """Ends of a relayed connection; the peers are `(CLIENT, number)` and `(SERVER, number)`."""
 PIECE_BYTES = 1448
-"""Largest piece of a relayed connection [B]: the data of a TCP packet on Ethernet."""
+"""Largest piece of a relayed connection: as much as one TCP packet carries on Ethernet [B]."""
 FORMS = "udp:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:PATH:BAUD"
 
 

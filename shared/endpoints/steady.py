@@ -1,7 +1,7 @@
 """Steady time for an endpoint whose host's clock jumps.
 
 An endpoint needs a clock that advances at the rate of real time. If the clock is set back or ahead,
-scheduled work would be late or early, and time stamps from before and after could not be compared.
+scheduled work would be late or early, and time stamps before and after it could not be compared.
 `Steady` removes every jump, so that the endpoint's time stands still during the jump, and then
 continues:
 

@@ -1,1 +1,1 @@
-"""Events: what endpoints and processes report, as typed values; a module for each kind."""
+"""Events: reports of endpoints and processes, as typed values; there is a module for each kind."""

@@ -27,8 +27,8 @@ class Event(msgspec.Struct, frozen=True, tag=True):
     """Base of all events; subclasses inherit its settings for msgspec and mypy."""
 
     sentence = ""
-    """Sentence for the operator, with fields and properties in braces; an event that needs more
-    defines `__str__`."""
+    """Sentence for the operator, with fields and properties in braces; an event whose sentence
+    depends on its values defines `__str__`."""
 
     def __str__(self) -> str:
         return self.sentence.format_map(self)
@@ -60,7 +60,7 @@ class ReferenceTooFast(Event):
 
 class Omitted(Event):
     kind: str
-    """Name of the events' class; "lines" if the output was not read in time."""
+    """Class of the dropped events; "lines" if log lines were dropped because nobody read them."""
     count: int
 
     def __str__(self) -> str:

@@ -109,7 +109,7 @@ def _messages(content: bytes) -> dict[str, list[list[Any]]]:
 
 
 def _format(content: bytes, at: int) -> tuple[int, int, _Fields | None]:
-    """Type and length of the messages that an FMT describes, and a reader if they are wanted."""
+    """Type and length of the messages that an FMT describes, and a reader if these are wanted."""
     of, size, name, codes, columns = Struct("<BB4s16s64s").unpack_from(content, at)
     title, named = (_text(each) for each in (name, codes))
     fields = _text(columns).split(",")

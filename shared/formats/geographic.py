@@ -111,6 +111,6 @@ def above_sea(places: Array, axes: int, origin: Origin | None, home: Origin = ()
     if not altitude:
         raise ValueError(
             "reference.origin = [latitude, longitude, altitude], with the altitude of the "
-            "scenario's origin: those of the file are above the sea"
+            "scenario's origin, because the file's altitudes are above the sea"
         )
     return np.concatenate([flat, places[:, 2:] - altitude[0]], axis=1)

@@ -98,7 +98,7 @@ def _track(name: str, tracks: list[Element]) -> Path:
         whens = [each.text or "" for each in track if _tag(each) == "when"]
         coords = [each.text or "" for each in track if _tag(each) == "coord"]
         if len(whens) != len(coords):
-            raise ValueError(f"expected as many times as places, got {len(whens)}, {len(coords)}")
+            raise ValueError(f"expected a time per place, got {len(whens)} for {len(coords)}")
         for when, coord in zip(whens, coords, strict=True):
             if coord.strip():  # an empty entry: an unknown place
                 _append(numbers, coord.split())

@@ -113,7 +113,7 @@ class Log:
             run = self.begin(None)
         if run.peer not in (peer, ""):
             both = f"got answers of {run.peer} and of {peer}"
-            raise LogError(f"{both}, expected one host: keep the lines of one")
+            raise LogError(f"{both}, expected one host: keep the lines of one host")
         placed = run.place(number)
         is_answered = isfinite(trip_s)
         present = run.trips.get(-1 if placed is None else placed, (nan, nan))
@@ -148,8 +148,8 @@ class Log:
         before = 0 if run.first is not None else max(min(run.trips, default=0) - first, 0)
         if last < run.last or came < answered:
             raise LogError(
-                f"got a summary of {sent} sent and {came} received, but there are more above it, "
-                "expected that of the same run: delete the line"
+                f"got a summary of {sent} sent and {came} received, but more packets above it, "
+                "expected the summary of the same run: delete the line"
             )
         if run.numbered and came - answered > before:
             raise LogError(
@@ -168,7 +168,7 @@ def _command(log: Log, found: re.Match[str]) -> None:
 
 
 def _head(log: Log, found: re.Match[str]) -> None:
-    # iputils counts from 1; busybox and BSD from 0, and print a colon: "(192.0.2.1): 56 data".
+    # iputils counts from 1; busybox and BSD count from 0 and print a colon: "(192.0.2.1): 56 data".
     log.begin(0 if found["six"] or found["colon"] else 1)
 
 

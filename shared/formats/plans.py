@@ -41,7 +41,7 @@ MULTICOPTERS, ROVERS = (None, 0, 2, 3, 4, 13, 14, 15, 29, 35), (10, 11)
 """MAV_TYPE of vehicles that can stop anywhere: aircraft (None: type not given), and vehicles on the
 ground or on water."""
 SCAN, SCANS = "TransectStyleComplexItem", ("survey", "CorridorScan")
-"""Member with a complex item's simple items, and the types of complex items with this member."""
+"""Member that has a complex item's simple items, and types of complex items with this member."""
 VERSIONS = {"plan": (1,), "mission": (2,), "geofence": (2,), SCAN: (1, 2)}
 """Supported versions of a plan's parts; a part without a version counts as supported."""
 WRONG = (KeyError, TypeError, AttributeError, IndexError)

@@ -323,7 +323,7 @@ def _checked(
     _refuse(delay_s < 0.0, delay_s, "a delay of at least 0, or -1 of a lost packet")
     _refuse(delay_s > DELAY_MAX_S, delay_s, f"a delay of at most {DELAY_MAX_S:g} s")
     if lost.all():
-        raise ValueError("got lost packets only, expected at least one that arrived")
+        raise ValueError("got lost packets only, expected at least one packet that arrived")
     order = np.argsort(time_s, kind="stable")
     begin_s += float(time_s[order[0]])
     time_s, delay_s, lost = time_s[order] - time_s[order[0]], delay_s[order], lost[order]

@@ -59,7 +59,7 @@ def lasts_s(content: bytes, axes: int, speed_mps: float = 1.0) -> float:
 
 
 def axes_of(content: bytes) -> int:
-    """Number of axes of a file: 3 if its points have heights.
+    """Number of axes of a file: 3 if its points have heights, otherwise 2.
 
     Raises:
         ValueError: the file is invalid.

@@ -24,7 +24,7 @@ from skytether.shared.scenario.grammar import GrammarError
 from skytether.shared.scenario.registry import File
 
 CRS84 = {"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}
-"""The only value of the member `crs` that is accepted: the coordinates of RFC 7946."""
+"""Only accepted value of a GeoJSON file's member `crs`: it names the coordinates of RFC 7946."""
 Frame = Callable[[Any], Array]
 """Function from a list of coordinates to metres north and east of the origin; shape (n, 2)."""
 RING = "LinearRing"
@@ -52,7 +52,7 @@ def geojson(file: File) -> list[Zone]:
 
 
 def kml(file: File, *, is_fence: bool) -> list[Zone]:
-    """Zones of the polygons in a KML file; holes are treated as in `geojson`.
+    """Zones of the polygons in a KML file. A hole in a fence is a zone to keep out of.
 
     Raises:
         ValueError: the file is not KML.
@@ -111,7 +111,7 @@ def _placemark(
 
 
 def _bare(placemark: ElementTree.Element, kind: str) -> Iterator[ElementTree.Element]:
-    """Geometries of a kind in a placemark, except the rings of its polygons."""
+    """Geometries of one kind in a placemark, except the rings of its polygons."""
     rings = {id(each) for polygon in _below(placemark, "Polygon") for each in polygon.iter()}
     return (each for each in _below(placemark, kind) if id(each) not in rings)
 
@@ -131,7 +131,7 @@ def _below(element: ElementTree.Element, tag: str) -> Iterator[ElementTree.Eleme
     """Elements with a tag, of any namespace, below an element.
 
     Raises:
-        ValueError: such an element contains another, which would make searches quadratic in time.
+        ValueError: elements with this tag are nested, so that searches would take quadratic time.
     """
     for found in _tagged(element, tag):
         if next(islice(_tagged(found, tag), 1, None), None) is not None:

@@ -31,7 +31,7 @@ from skytether.shared.law.terms import Terms
 class DeadTime(NamedTuple):
     steps: int
     rest: Axis | None
-    """Model over the remainder r, eq. (4) with r for Δt; None without a remainder."""
+    """Model of eq. (4) for a step as long as the remainder r; None without a remainder."""
     late: tuple[float, float]
     """Matrix L, for position [s] and velocity; 0 without a remainder."""
 

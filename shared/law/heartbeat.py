@@ -62,7 +62,7 @@ def false_per_h(silence_ns: int, timeout_ns: int, loss: float) -> float:
 @lru_cache
 def silences(timeout_ns: int, step_ns: int) -> tuple[tuple[float, int], ...]:
     """Pairs of a loss ratio and a heartbeat interval [ns], longest interval first. Up to its loss
-    ratio an interval keeps `false_per_h` within FALSE_PER_H; the last serves any higher loss.
+    ratio an interval keeps `false_per_h` within FALSE_PER_H; the last one serves all higher losses.
     """
     fewest, most = -(-timeout_ns // (MOST * step_ns)), timeout_ns // (FEWEST * step_ns)
     counts = range(max(most, 1), max(fewest, 1) - 1, -1) or (1,)
@@ -145,7 +145,7 @@ class Hearing:
     def silence_ns(self) -> int:
         """Longest silence to allow the other end [ns].
 
-        Unless it is fixed, it is T minus half a step, because steps do not begin exactly on time.
+        Unless the silence is fixed, it is T minus half a step, because steps may begin late.
         """
         if self._fixed_ns is not None:
             return self._fixed_ns

@@ -197,7 +197,7 @@ def step(
 
 
 MODEL = len(Axis._fields)
-"""Number of columns of the model, which come first in a table with one row per axis."""
+"""Number of columns that hold the model: the first columns of a table with one row per axis."""
 LENGTH, SPEED, BRAKE, BOUND, FEEDS_BACK, GAIN_P, GAIN_V, DISTURBANCE = range(
     MODEL, MODEL + len(AxisHorizon._fields) - 2
 )

@@ -70,7 +70,7 @@ def spline_at(knots: Knots, spacing: int, dt_s: float, stage: int) -> tuple[floa
     last = len(knots) // 2 - 1
     knot = stage // spacing
     if knot < 0 or knot >= last:
-        # Straight before the first and after the last knot: the cubics would bend away there.
+        # The spline is straight before the first and after the last knot: cubics would bend away.
         knot = 0 if knot < 0 else last
         v = float(knots[2 * knot + 1])
         return float(knots[2 * knot]) + (stage - knot * spacing) * dt_s * v, v

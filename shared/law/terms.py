@@ -70,7 +70,7 @@ class Terms(NamedTuple):
     """Digest of the content of the trajectory's CSV file."""
     separation_m: float = 0.5
     """Smallest distance between vehicles of a mission [m]. A standby server must have the same
-    value of this field and of the next two."""
+    value of this field and of the next two fields."""
     height_m: float = 0.0
     """Smallest vertical distance between vehicles of a mission [m]; 0: `separation_m`."""
     tube_m: float = 0.15

@@ -18,7 +18,7 @@ from skytether.shared.scenario.schema import Contradiction, Scenario
 TINY = 1e-9
 """Rounding tolerance of times and heights."""
 PLACES_MAX = 100_000_000
-"""Largest number of positions that are checked in a show; this takes about ten seconds."""
+"""Largest number of positions that are checked in a show, which takes about ten seconds."""
 
 
 def of_keys(scenario: Scenario) -> Iterator[Contradiction]:

@@ -179,7 +179,7 @@ class _Stays(NamedTuple):
         return float(np.linalg.norm(self.places_m[one] - self.places_m[other]))
 
     def nearest(self, apart_m: float) -> tuple[int, int] | None:
-        """First two simultaneous stays nearer than `apart_m`; None if there are none.
+        """First two simultaneous stays nearer than `apart_m`; None if no two stays are so near.
 
         Stays are sorted into a grid with cells of `apart_m`, and by time within a cell. A stay is
         compared only with stays that begin before it ends, in its own and the neighbouring cells.
@@ -267,7 +267,7 @@ def _nearest_on_paths(
 ) -> tuple[int, int, float, float] | None:
     """First two vehicles of a show nearer than `apart_m` to each other, see `Mission.nearest`.
 
-    The times of all vehicles' goals are merged; between two successive times each flies straight.
+    The times of all goals are merged; each vehicle flies straight between two successive times.
     """
     numbers = list(goals)
     times_s = np.unique(np.concatenate([own_s for own_s, _ in goals.values()]))
@@ -337,8 +337,8 @@ class Guided:
         return self._kept(vehicle)
 
     def _of(self, vehicle: int) -> Reference:
-        """Reference of a vehicle: the mission's, or after time 0 the goal that replaces the
-        mission's goals.
+        """Reference of a vehicle: the mission's reference, or after time 0 the goal that replaces
+        the mission's goals.
         """
         original = self._references(vehicle)
 
