@@ -280,7 +280,7 @@ def half_trip_ns(seen: Seen, row: int) -> int:
 
 @part
 def shortest_ns(seen: Seen, row: int) -> int:
-    """Shortest estimated uplink delay of the last ECHOES packets [ns]; negative if there are fewer."""
+    """Shortest estimated uplink delay of the last ECHOES packets [ns]; negative if fewer came."""
     return least(seen.echoes[row]) - seen.vehicles[row]["adopted"]
 
 
