@@ -2,11 +2,11 @@
 
 Each observation is compared with the vehicle's last accepted observation:
 
-    clock     with the delay of the other direction, its delay must give a round trip of at least 0
-    horizon   the horizon in force, and its first flown step, must not go back nor lie in the future
+    clock     its delay and that of the other direction must give a round trip of at least 0
+    horizon   the horizon in force and its first flown step must not go back, nor be in the future
     jump      position and velocity must change by no more than a vehicle can fly
 
-An observation that fails is dropped and counted. In case the last accepted observation was wrong,
+An observation that fails is dropped and counted. But the last accepted observation may be wrong: so
 REPEATS observations in a row that are consistent with each other are accepted, and the vehicle's
 data are reset.
 """

@@ -149,8 +149,8 @@ class Reception:
         return dropped
 
     def _note_repeat(self, datagram: Datagram, now_ns: int) -> bool:
-        """Note another address that repeats a vehicle's recent packet; return whether the vehicle
-        has several paths and the copy came over an unproven path.
+        """Note that a vehicle's recent packet came again from another address. Return whether the
+        vehicle has several paths and the copy came over an unproven path.
         """
         vehicle = self._gate.repeated(datagram)
         session = None if vehicle is None else self._sessions.live(vehicle)
@@ -344,7 +344,7 @@ class Reception:
             self._answer(question, call, datagram)
 
     def _hear_time(self, session: Session, message: Time, now_ns: int) -> None:
-        """Narrow a clock offset's bounds by the vehicle's time of day, if this host knows it too."""
+        """Narrow a clock offset's bounds by the vehicle's time of day, if this host also has one."""
         error_ns = self.time and self.time.error_at(now_ns)
         if error_ns is None or self.time is None:
             return

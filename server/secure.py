@@ -74,7 +74,7 @@ class _HandshakeRate:
 
     def __init__(self, now_ns: int) -> None:
         self._granted_ns = now_ns - SECOND_NS
-        """Time until which handshakes are used up; each handshake adds 1 / HANDSHAKES s [ns]."""
+        """Earliest time of the next handshake minus 1 / HANDSHAKES s [ns]."""
 
     def grant(self, now_ns: int) -> bool:
         """Whether another handshake is granted."""

@@ -61,8 +61,8 @@ class AssignmentOfTwo(Assignment):
         return with_leadership(said.lead.number, plan) if said else plan
 
     def spread(self, sessions: Iterable[Any], now_ns: int) -> Iterator[Datagram]:
-        """Send the largest leadership number to vehicles that follow a smaller number, and for a
-        while after a change of the motions' limits these limits to all vehicles.
+        """Send the largest leadership number to vehicles that follow a smaller number. For a while
+        after a change of the motions' limits, send these limits to all vehicles.
         """
         is_changed = self.changed_ns is not None and now_ns < self.changed_ns + LIMITS_NS
         for session in sessions:

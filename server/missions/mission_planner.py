@@ -74,7 +74,7 @@ TURN = 2.0 * np.pi * np.arange(32) / 32
 AROUND = np.stack([np.cos(TURN), np.sin(TURN)], axis=1)
 """Directions in which a vehicle at rest within a zone searches for a way out."""
 OUT_M, OUT_STEPS = 0.1, 500
-"""Distance between candidate positions on the way out [m], and their number."""
+"""Distance between the positions that are tried on the way out of a zone [m], and their number."""
 NEARER_M = 1e-3
 """Tolerance: distance by which a vehicle that leaves a zone may come nearer to the zone [m]."""
 ZONE = "a zone"

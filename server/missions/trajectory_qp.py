@@ -60,7 +60,7 @@ class TrajectoryQP:
 
     Args:
         acceleration_mps2: largest acceleration on an axis, a_max [m/s²].
-        speed_mps: largest speed, of all axes together [m/s]; 0: only inputs are bounded.
+        speed_mps: largest speed over all axes [m/s]; 0: only the inputs are bounded.
     """
 
     def __init__(self, terms: Terms, acceleration_mps2: float, speed_mps: float) -> None:

@@ -84,7 +84,7 @@ class VehicleMotions:
         return motions
 
     def adapt_copies(self, prompt: bool) -> None:
-        """Send each motion more often after a loss, less often after prompt acknowledgements."""
+        """Send later motions more times after a loss, fewer times after prompt acknowledgements."""
         self.prompt_count = self.prompt_count + 1 if prompt else 0
         if not prompt:
             self.copies = min(self.copies + 1, COPIES_MAX)

@@ -17,18 +17,18 @@ from skytether.shared.missions.zones import Zone, Zones
 WAYPOINT_M = 3.0
 """Largest distance of a waypoint that is not on the route [m]."""
 AHEAD_M = 1.5
-"""Distance of a waypoint on a route around zones from the vehicle, along this route [m]."""
+"""Distance from a vehicle to its waypoint, along the route around zones [m]."""
 TURN, TURN_MAX, TURN_BACK = 0.5, 2.8, 0.8
 """Angles by which waypoints of a stuck vehicle turn to the right [rad]: step, largest angle before
 random directions, and step back when the vehicle moves."""
 DETOUR_M, DETOUR_S = 5.0, 20.0
-"""Range in which a stuck vehicle avoids resting vehicles [m], and duration of this [s]."""
+"""Distance within which a stuck vehicle avoids resting vehicles [m], and time of avoidance [s]."""
 CLOSED_M = 0.6
 """Distance ahead of a vehicle at which its route is closed [m]; three tubes if that is more."""
 AROUND = np.stack([np.cos(np.pi * np.arange(8) / 4.0), np.sin(np.pi * np.arange(8) / 4.0)], axis=1)
 """Corners of an octagon of radius 1 around the origin; shape (8, 2)."""
 TRIES = 5
-"""Number of directions tried at each plan."""
+"""Number of directions in which a waypoint is tried for each plan."""
 
 
 class Waypoints:

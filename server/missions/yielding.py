@@ -90,14 +90,14 @@ def place_to_yield(
     routes: RoutesAroundZones,
     clearance_m: float,
 ) -> Array | None:
-    """Position off a path to which a vehicle can fly from `home`; None if there is none.
+    """Position beside a path, within reach of a vehicle at `home`; None if there is none.
 
     Args:
         home: position at which the vehicle rests [m]; shape (axes,).
         way: path of the passing vehicle, from its position [m]; shape (n, axes).
         others: present or future resting positions of the other vehicles [m]; shape (m, axes).
         apart_m: distance between vehicles [m].
-        scale: factors of coordinates in distances between vehicles; shape (axes,).
+        scale: factor on each coordinate in distances between vehicles; shape (axes,).
         clearance_m: distance from zones [m].
     """
     turn = 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS

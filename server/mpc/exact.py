@@ -3,10 +3,10 @@
 If the method of `server.mpc.riccati` does not converge, DAQP, a dual active-set method, solves the
 QP. DAQP's answer is used only if it meets the optimality conditions.
 
-For a single vehicle DAQP is as fast (24 µs for 10 in a hot loop, the same in a paced loop). For
-many vehicles the Riccati method is faster, as it solves their QPs side by side: a vehicle takes 0.9
-to 1.7 µs with 64 vehicles and 0.8 to 1.8 µs with 1000. DAQP, called for one vehicle after the
-other, takes 13 to 17 and 21 to 29 µs (axes 2, H = 50; one run at commit df76e24).
+For a single vehicle DAQP would suffice: 24 µs in place of 10 in a hot loop, the same in a paced
+loop. For many vehicles the Riccati method is faster, because it solves their QPs side by side: a
+vehicle takes 0.9 to 1.7 µs with 64 vehicles and 0.8 to 1.8 µs with 1000. DAQP, called for one
+vehicle after the other, takes 13 to 17 and 21 to 29 µs (axes 2, H = 50; one run at commit df76e24).
 """
 
 import daqp

@@ -341,7 +341,7 @@ def _plan(batch: PlanBatch, rows: I1, steps: I1, work: RiccatiWorkspace) -> int:
     while waiting - first >= WIDTH:
         undone += _plan_some(batch, batch.together, picked[first : first + WIDTH], LATER, work)
         first += WIDTH
-    # The vehicles left are too few for a full batch. Planned alone, each gets the same bits
+    # The vehicles left are too few for a full batch. Planned alone, each gets the same plan
     # (tests/mpc/test_hierarchical.py).
     for at in range(first, waiting):
         undone += _plan_some(batch, batch.alone, picked[at : at + 1], LATER, work)

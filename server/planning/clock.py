@@ -59,7 +59,7 @@ UNSEEN = 2**61
 
 
 class Contradiction(IntEnum):
-    """Source of the earlier bound of a clock offset that a new sample contradicts."""
+    """Earlier bound of a clock offset that a new sample contradicts, by the bound's source."""
 
     NOTHING = 0
     CLOCK = 1
@@ -121,9 +121,9 @@ FORGOTTEN = ("newest", "heard", "echoes", "adopted", "sent", "echo")
 
 class StepError(NamedTuple):
     early: float
-    """Number of steps that the vehicle may be ahead of the step number by the server's count."""
+    """Number of steps by which the vehicle may be ahead of its step by the server's count."""
     late: float
-    """Number of steps that the vehicle may be behind the step number by the server's count."""
+    """Number of steps by which the vehicle may be behind its step by the server's count."""
 
 
 EXACT = StepError(0.0, 0.0)

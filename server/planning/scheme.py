@@ -352,8 +352,8 @@ class SchemeCode(NamedTuple):
 
     make: Callable[[Fleet], Scheme]
     kernels: Callable[[str], Sequence[ModuleType]]
-    """Modules and packages whose kernels only this scheme calls, for the text of
-    `control.scheme`."""
+    """Function from the text of `control.scheme` to the modules and packages whose kernels only
+    this scheme calls."""
     references: Callable[[Scenario, Given, int], Given] = given_references
     """Function that makes the scheme's desired trajectories from given trajectories; the last
     argument is the largest number of vehicles."""

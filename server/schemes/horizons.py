@@ -28,7 +28,7 @@ NO_FEEDBACK = memoryview(b"")
 def uplink_max_ns(terms: Terms) -> int:
     """Longest uplink delay at which a horizon can still be flown [ns]."""
     if terms.scheme not in INDEXED:
-        return UNSEEN  # the vehicle flies the first input whenever it arrives
+        return UNSEEN  # the vehicle flies the first input whenever a horizon arrives
     return (ahead_max(terms) if terms.scheme in COMMITTING else terms.horizon) * terms.dt_ns
 
 

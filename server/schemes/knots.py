@@ -7,7 +7,7 @@ from skytether.shared.law import spline
 from skytether.shared.wire.protocol import KNOTS_MAX
 
 INTERVALS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, KNOTS_MAX - 1])
-"""Numbers of intervals between knots that are tried, in this order."""
+"""Numbers of intervals of a spline that are tried, in this order."""
 
 spline_at = shared(spline.spline_at)
 

@@ -171,7 +171,7 @@ def _observe_disturbance(
             w, change = memory.disturbance[row, i], (memory.flown[row, i] - u) / m
             p, v = 0.0, velocity
             for step in range(m):
-                # Inputs between two observations are not reported: interpolate linearly.
+                # Inputs between two observations are not reported, but interpolated linearly here.
                 p, v = advance(axis, p, v, u + step * change + w)
             off, trip_ns = memory.state[row, i, 1] - v, (k - end) * settings.dt_ns
             memory.disturbance[row, i] = updated_disturbance(

@@ -8,12 +8,12 @@ At step k the server sends the trajectory to follow from k on:
 - the plan of a plug-in's planner along the desired trajectory, extrapolated where unknown
   (`server.mpc.plugin_planners`).
 
-It is sent as a spline with the fewest uniform knots that keep its error within
+The trajectory is sent as a spline with the fewest uniform knots that keep its error within
 `control.spline_error_m` (`shared.law.spline`); a single state is one knot. A regulator aboard
 follows the spline, so the newest observation serves as the server's estimate.
 
 The server is not certain which trajectory the vehicle follows: an observation acknowledges the
-trajectory in force, and later ones may be in flight or lost. With the measured loss rate ℓ and the
+trajectory in force, and later trajectories may be in flight or lost. With the loss rate ℓ and the
 share S(t) of delays longer than t, a trajectory sent a time t before an observation that does not
 acknowledge it will still arrive with the probability
 

@@ -71,7 +71,7 @@ def read(path: Path, most: int, *, is_input: bool = True) -> bytes:
     """Content of a file of at most `most` bytes.
 
     Raises:
-        OSError: as `opened`; or the file is too large.
+        OSError: as for `opened`, or because the file is too large.
         ValueError: the name is invalid.
     """
     with opened(path, is_input=is_input) as file:

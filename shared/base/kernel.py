@@ -87,7 +87,7 @@ def _at_first_call(dispatcher: Any) -> Any:
     """Kernel that is compiled for its annotations on the first call; `dispatcher` is numba's.
 
     A dispatcher determines the types of all arguments at every call to find the machine code for
-    them: with 45 arrays in tuples that took 15 µs, and 70 µs when a tick comes every 50 ms and the
+    them: with 45 arrays in tuples this took 15 µs, and 70 µs when a tick comes every 50 ms and the
     caches are cold. Here there is only one machine code, so types are checked at the first call
     only, and later calls run it directly. With `check_types` every call is checked.
     """

@@ -34,7 +34,7 @@ class Event(msgspec.Struct, frozen=True, tag=True):
         return self.sentence.format_map(self)
 
     def __getitem__(self, name: str) -> Any:
-        """Value of a field or property, for its name in braces in `sentence`."""
+        """Value of the field or property whose name is in braces in `sentence`."""
         return getattr(self, name)
 
 

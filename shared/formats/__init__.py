@@ -21,7 +21,7 @@ from skytether.shared.formats.geographic import Origin
 from skytether.shared.law.model import Array
 
 Tracks = dict[int, tuple[Array, Array]]
-"""Rising times from 0 [s; shape (n,)] and points [m; shape (n, axes)], by number of the vehicle."""
+"""By number of the vehicle: rising times from 0 [s; shape (n,)], points [m; shape (n, axes)]."""
 BOM = b"\xef\xbb\xbf"
 HEAD_BYTES = 4096
 """Size of a file's beginning from which its format is recognised [B]."""

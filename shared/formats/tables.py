@@ -120,7 +120,7 @@ def _table(content: bytes, axes: int, origin: Origin | None) -> Tracks:
 
 
 def _polynomials(content: bytes, axes: int) -> tuple[Array, Array]:
-    """Points along polynomials of time since the beginning of each piece."""
+    """Points along polynomials; each piece is a polynomial of the time since its beginning."""
     names = [f"{axis}^{power}" for axis in "xyz"[:axes] for power in range(DEGREE + 1)]
     rows, lines = _read(content, ["duration", *names])
     lengths_s = rows[:, 0]

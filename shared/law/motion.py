@@ -82,9 +82,9 @@ class Clearances(NamedTuple):
     """Distances that motions of a mission keep [m]."""
 
     apart_m: float
-    """Distance of motions from each other: the required separation plus both tubes."""
+    """Distance that motions keep from each other: the required separation plus both tubes."""
     tube_m: float
-    """Distance of motions from zones: the largest distance of a vehicle from its motion."""
+    """Distance that motions keep from zones: the largest distance of a vehicle from its motion."""
     bend_m: float
     """Largest distance of a motion from the straight pieces that approximate it, see SAMPLES."""
 

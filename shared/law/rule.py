@@ -49,7 +49,7 @@ class AxisHorizon(NamedTuple):
 
 
 def lasting(length: int, made_for: int, observed: int, age_max: int) -> int:
-    """Number of a horizon's inputs that may be flown; 0 or a negative number: none.
+    """Number of a horizon's inputs that may be flown; no input if this is 0 or negative.
 
     Args:
         length: number of the horizon's inputs.

@@ -86,7 +86,7 @@ class Mission(OfFleet):
         if self._path:
             return self._path(t)
         t = np.asarray(t, dtype=np.float64)
-        if not t.ndim:  # called once per step of a vehicle: faster without arrays
+        if not t.ndim:  # called once per step of a vehicle, and faster without arrays
             state = np.zeros((self._axes, 2))
             state[:, 0] = self._points_m[max(bisect_right(self._times, float(t)) - 1, 0)]
             return state

@@ -161,7 +161,7 @@ class Zones:
         """Clearances in space [m], from plane clearances and altitudes; shape (n, zones)."""
         off = np.maximum(self._low - height, height - self._high)
         apart = np.where(off > 0.0, np.hypot(off, np.maximum(signed, 0.0)), np.maximum(signed, off))
-        # Within a fence: distance from the nearest of its sides, floor and ceiling.
+        # The clearance in a fence is the distance from its nearest side, floor or ceiling.
         within = np.minimum(signed, np.minimum(height - self._low, self._high - height))
         return np.where(self._sign > 0.0, within, apart)
 

@@ -178,7 +178,7 @@ def _no_trigger(control: ControlConfig) -> Iterator[Contradiction]:
 def _no_policies(
     key: str, text: str, table: PluginTable, control: ControlConfig
 ) -> Iterator[Contradiction]:
-    """Contradictions of a text of policies: bad grammar, or a figure that the scheme lacks."""
+    """Contradictions of a text of policies: wrong grammar, or use of a figure not in the scheme."""
     try:
         expression = table.parse(text)
     except GrammarError as error:

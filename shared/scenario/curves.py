@@ -1,5 +1,5 @@
-"""Smooth closed curves as desired trajectories: entries of the table `REFERENCES`. Its other
-entries are in `points` and `targets`.
+"""Smooth closed curves as desired trajectories: entries of the table `REFERENCES`. The table's
+other entries are in `points` and `targets`.
 
 Each function makes a desired trajectory (`shared.scenario.reference`) from the scenario's keys, as
 a shape of a plug-in does.
