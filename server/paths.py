@@ -308,7 +308,7 @@ class RoutesOverPaths(Routes):
 
 
 make = RoutesOverPaths
-"""See `server.routes.Routes.of_several`."""
+"""Function that `server.routes.Routes.of_several` calls to make the routes."""
 
 
 def _paths(session: Session) -> ServerPaths | None:

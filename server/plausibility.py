@@ -46,7 +46,7 @@ class Statement:
     backward: int
     """Time difference G, see `server.planning.clock` [ns]."""
     count: int
-    """Number of successive consistent rejected observations up to this one; 0 if accepted."""
+    """Number of consistent observations rejected in a row up to this one; 0 if accepted."""
 
 
 STATEMENT = record(Statement)

@@ -66,7 +66,7 @@ RESTS_MPS = 0.2
 ARRIVED_M = 0.02
 """Distance from the goal up to which the end of a motion counts as at the goal [m]."""
 ROUNDS = 5
-"""Largest number of QPs per waypoint, each with further constraints."""
+"""Largest number of QPs for a waypoint; each QP has more constraints than the last."""
 STUCK = 0.3
 """Share of the distance to the waypoint, of 2 m at most, that a plan must cover; if a plan covers
 less, the vehicle counts as stuck."""
@@ -212,7 +212,7 @@ class MissionPlanner(SplineScheme):
                 vehicle.goal = None  # resets closed positions and progress: they fit the old zones
 
     def objection(self, scenario: Scenario, keys: frozenset[str]) -> str:
-        """See `Scheme`; refuses a zone in the way of a vehicle."""
+        """Reason why the keys cannot be changed now, such as a zone in the way of a vehicle."""
         objection = self._objection(zones(scenario)) if keys & ZONES else ""
         return f"mission.zones: got {objection}; nothing was changed" if objection else ""
 

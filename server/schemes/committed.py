@@ -137,7 +137,7 @@ class Replay:
         )
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """See `Scheme`: planning starts at k + d."""
+        """Predict x̂(k) and x̂(k+d); planning starts at step k + d."""
         lost = _foresee(
             self._settings,
             self._memory,

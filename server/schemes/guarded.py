@@ -53,7 +53,7 @@ class GuardedScheme(Scheme):
             self._inner.forget(row)
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`; False if the scheme fails."""
+        """Let the scheme store an observation, see `Scheme`; return False if the scheme fails."""
         with self._errors:
             return bool(self._inner.observe(row, observation))
         return False
@@ -62,7 +62,7 @@ class GuardedScheme(Scheme):
         """Do nothing, because `plan` also calls the scheme's `foresee`."""
 
     def plan(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """See `Scheme`; a plan is unsolved if the scheme fails or its plan cannot be flown."""
+        """Let the scheme plan; a plan counts as unsolved if it fails or cannot be flown."""
         for i in self._call(len(rows), partial(self._plan, rows, step, foresight)):
             _blank(_cut(foresight, slice(i, i + 1)), self.figures[i : i + 1], rows[i], step[i])
             self.figures["solved"][i], self.planned[i] = False, 0.0
@@ -77,7 +77,7 @@ class GuardedScheme(Scheme):
         self.figures[selected], self.planned[selected] = inner.figures[:n], inner.planned[:n]
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
-        """See `Scheme`; the plan of a vehicle for which the scheme fails is not sent."""
+        """Let the scheme store the plans; the plan of a vehicle for which it fails is not sent."""
         failed = self._call(len(rows), partial(self._remember, rows, step, foresight, event))
         self._withheld = {int(rows[i]) for i in failed}
 
@@ -99,7 +99,7 @@ class GuardedScheme(Scheme):
                 yield from packets
 
     def sent_plans(self, batch: Batch) -> SentPlans:
-        """See `Scheme`; zeros if the scheme fails."""
+        """Plans that are sent, for the record, see `Scheme`; zeros if the scheme fails."""
         with self._errors:
             return self._inner.sent_plans(batch)
         n, step = len(batch.sent), batch.step[batch.sent]

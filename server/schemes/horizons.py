@@ -39,16 +39,16 @@ class Predictor(Protocol):
     counts: Counter[str]
 
     def forget(self, row: int) -> None:
-        """See `Scheme`."""
+        """Delete the data of the vehicle in a row."""
 
     def observe(self, row: int, observation: Observation) -> bool:
-        """See `Scheme`."""
+        """Store an observation unless a newer one is stored; return whether it was stored."""
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """See `Scheme`."""
+        """Fill in the predictions of a `Foresight`, without its plans."""
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
-        """See `Scheme`."""
+        """Store the new plans; `event`: flags of the vehicles whose plan is sent, shape (n,)."""
 
 
 class InputScheme(Scheme):

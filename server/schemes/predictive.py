@@ -51,7 +51,7 @@ class EstimatorSettings(NamedTuple):
     """Whether observations are predicted to the present; False for the scheme "none"."""
     dt_ns: int
     decay: float
-    """See `observer.decay_of`."""
+    """Share of the observer's error that remains after a step, see `observer.decay_of`."""
     feeds_back: bool
 
 
@@ -126,7 +126,7 @@ class Estimator:
         return True
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:
-        """See `Scheme`: planning starts at k, from x̂(k).
+        """Predict x̂(k), from which planning starts at step k.
 
         Source: eq. (13).
         """

@@ -79,7 +79,7 @@ class ReplaySettings(NamedTuple):
     brake: float
     """Reduction of the speed in a step of braking [m/s]."""
     decay: float
-    """See `observer.decay_of`."""
+    """Share of the observer's error that remains after a step, see `observer.decay_of`."""
     follow: float
     """Share of a velocity jump that the observer's low-pass filter has not followed after a step.
     """

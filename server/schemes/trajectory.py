@@ -123,7 +123,7 @@ class Settings(NamedTuple):
     lead_s: F1
     """Time h, by which velocity errors are weighed against position errors [s]; shape (axes,)."""
     error_m: float
-    """`control.spline_error_m`: largest error of a spline, if KNOTS_MAX suffices [m]."""
+    """Largest error of a spline if KNOTS_MAX knots suffice [m]: `control.spline_error_m`."""
     plans: bool
     """Whether the nominal motion is sent instead of the desired trajectory itself."""
 
@@ -198,7 +198,7 @@ class Guidance(SplineScheme):
         return True
 
     def foresee(self, rows: Indices, step: Indices, foresight: Foresight) -> None:  # noqa: ARG002
-        """See `Scheme`: the estimate is the newest observation."""
+        """Fill in the estimates, which are the newest observations."""
         n = len(rows)
         foresight.estimate[:n] = foresight.start[:n] = self._memory.state[rows]
 
@@ -245,7 +245,7 @@ class Guidance(SplineScheme):
         self.figures["solved"][:n] = [plan is not None for plan in plans]
 
     def remember(self, rows: Indices, step: Indices, foresight: Foresight, event: Flags) -> None:
-        """See `Scheme`; splines are fitted only for vehicles whose trajectory is sent."""
+        """Fit and store splines for the vehicles whose trajectory is sent."""
         intended = self._intended
         _fit_and_store(self._settings, self._memory, intended, rows, step, event, foresight.splines)
 

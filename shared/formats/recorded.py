@@ -232,7 +232,7 @@ def _unit(values: Array, name: str, low: float, high: float) -> float:
 
 
 class _Stamp(msgspec.Struct):
-    """Time at which a packet was sent, on a monotonic clock, or time of day [ns]."""
+    """Time at which a packet was sent [ns]: on a monotonic clock, or the time of day."""
 
     monotonic: float | None = None
     wall: float | None = None

@@ -13,7 +13,7 @@ class Limits(NamedTuple):
     speed_mps: float
     acceleration_mps2: float
     asymmetry_s: float
-    """Bound of the clocks' error, see `link.asymmetry_s` [s]."""
+    """Value of `link.asymmetry_s` [s], which bounds the error of the clocks."""
     zones: str
     """Digest of the zones."""
 
