@@ -43,7 +43,7 @@ class Grid:
         self.missed = 0
         self._missed_ns: deque[int] = deque(maxlen=MISSES_MAX + 1)
         self.degraded = False
-        """Whether the server is degraded: it misses too many ticks."""
+        """Whether the server is degraded because it misses too many ticks."""
 
     def arm(self, now_ns: int) -> None:
         dt_ns = self._dt_ns

@@ -19,7 +19,7 @@ allow. `tube_m` is the largest distance of a vehicle from its motion (wind, trac
 more distance from a vehicle observed outside its tube. Motions sent earlier already keep D. So
 whichever packets are lost or late, and whichever motions are accepted, vehicles are `separation_m`
 apart if each stays in its tube (theorem: docs/together-proof.md). The distance from zones is
-`tube_m`. A vehicle can always stay on its motion in force: this needs no packet.
+`tube_m`. A vehicle can always stay on its motion in force, because this needs no packet.
 
 `mission_state` has the motions that may be flown, `trajectory_qp` the QP, `separation` and
 `half_planes` the distances, `routes` the paths around zones, `waypoints` the next target of a

@@ -175,8 +175,8 @@ class ClockMap:
         """Reset the row for another vehicle, or for a new session.
 
         Args:
-            life: the vehicle's number and its client's boot id, or None if unknown. With the same
-                boot id, step 0 is the same and bounds found earlier remain valid.
+            life: the vehicle's number and its client's boot id, or None if unknown. If both are
+                unchanged, so is the vehicle's step 0, and bounds found earlier remain valid.
         """
         self.seen.minimum[row], self.seen.samples[row] = UNSEEN, 0
         self.seen.echoes[row] = -UNSEEN

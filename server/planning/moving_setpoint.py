@@ -14,7 +14,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 
 MEMORY_S = 0.2
-"""Time constant of the mean velocity [s]; with a smaller value errors of 2 cm in moves disturb."""
+"""Time constant of the mean velocity [s], just long enough to smooth errors of 2 cm in moves."""
 REST_S = 1.0
 """Time without a move after which a point is at rest [s]."""
 

@@ -1,4 +1,4 @@
-"""Splines sent to vehicles: their messages, and their inputs for the record."""
+"""Splines sent to vehicles: encoded as messages, and as inputs for the record."""
 
 from collections.abc import Callable, Iterator
 

@@ -57,5 +57,5 @@ class StateGap(Trigger):
 
 @trigger(needs="cost_gap")
 def cost_gap(situation: Situation, c: Amount = 0.05) -> Verdict:
-    """Sends if the cost gap exceeds c: cost with the old plan minus cost with the new plan."""
+    """Sends if the cost gap (cost with the old plan minus cost with the new plan) exceeds c."""
     return above(situation, Compared.COST_GAP, c)

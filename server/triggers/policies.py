@@ -15,7 +15,7 @@ from skytether.shared.telemetry.record import Compared
 
 @trigger
 def heartbeat(situation: Situation) -> Flags:
-    """Sends a plan in place of each heartbeat that is due: this adds no packet."""
+    """Sends a plan in place of each heartbeat that is due, so that no packet is added."""
     return situation.heartbeat_due
 
 

@@ -12,8 +12,8 @@ from skytether.shared.scenario.schema import Contradiction, Position, Scenario, 
 
 
 class FenceConfig(Section, frozen=True):
-    """Fence that the vehicle does not leave, independent of the received inputs. The vehicle uses
-    its own scenario's fence; a server with a fence refuses desired trajectories that cross it.
+    """Fence that the vehicle does not leave, whatever inputs it receives. The vehicle uses its own
+    scenario's fence; a server with a fence refuses desired trajectories that cross the fence.
     """
 
     low_m: OfEach[tuple[Position, ...]] = ()
@@ -25,8 +25,8 @@ class FenceConfig(Section, frozen=True):
     speed_mps: OfEach[Strength] = 0.0
     """Largest desired speed over all axes [m/s]; 0: only `model.u_max`."""
     wind_mps: OfEach[Annotated[float, Meta(ge=0, le=100)]] = 1.0
-    """Largest velocity added by wind or a wrong gain for which the fence holds [m/s]; widens the
-    margin."""
+    """Largest velocity that wind or a wrong gain may add without moving the vehicle over the fence
+    [m/s]; a larger value widens the margins."""
 
     @property
     def is_there(self) -> bool:

@@ -22,7 +22,7 @@ class MissionConfig(Section, frozen=True):
     separation_m: Term[Annotated[float, Meta(ge=1e-3, le=1e3)]] = 0.5
     """Smallest distance between two vehicles [m]."""
     height_m: Term[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Smallest vertical distance of two vehicles above each other [m]; 0: `separation_m`."""
+    """Smallest vertical distance if one vehicle is above another [m]; 0: `separation_m`."""
     tube_m: Term[Annotated[float, Meta(ge=0, le=1e3)]] = 0.15
     """Largest distance of a vehicle from its motion, by wind and tracking errors [m]."""
     speed_mps: OfServer[Strength] = 0.0
@@ -33,7 +33,7 @@ class MissionConfig(Section, frozen=True):
     """Whether goals are assigned to the nearest vehicles. All vehicles then need goals at the same
     times."""
     goals: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, GOALS)] = ""
-    """Goals that replace those of the mission: goal(vehicle, x, y), or goal(vehicle, x, y, z),
+    """Goals that replace the mission's goals: goal(vehicle, x, y), or goal(vehicle, x, y, z),
     combined with &."""
     zones: Annotated[str, Meta(max_length=4000), Key(Owner.SERVER, ZONES)] = ""
     """Zones combined with &: box(x0, x1, y0, y1), cylinder(x, y, radius), polygon(x, y, …),

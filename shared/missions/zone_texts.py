@@ -105,7 +105,7 @@ def corridor(width: float, *middle: float) -> list[Zone]:
     ends = np.concatenate([across[:1], across[:-1] + across[1:], across[-1:]])
     square = (ends**2).sum(axis=1, keepdims=True)
     if (square[1:-1] < 0.1).any():
-        raise ValueError("a corridor without a turn back")
+        raise ValueError("a corridor without a turn back on itself")
     ends[1:-1] *= 2.0 / square[1:-1]
     sides = [points + sign * width / 2.0 * ends for sign in (1.0, -1.0)]
     return [Zone("", np.concatenate([sides[0], sides[1][::-1]]), is_fence=True)]
