@@ -1,4 +1,4 @@
-"""`compare`: compares your contenders with the built-in ones, from Python."""
+"""Python function `compare`, which does the same as the command `skytether compare`."""
 
 from collections.abc import Iterable
 from itertools import product
@@ -29,22 +29,23 @@ def compare(
     out: str | PathLike[str] = "compare",
     workers: int = 1,
 ) -> list[Swept]:
-    """Compare contenders with the built-in ones as `skytether compare` does, and write its report.
+    """Fly your contenders and the built-in ones, and write the report of `skytether compare`.
 
         skytether.compare("mine.toml", cases=["target"], quick=True)
 
     Args:
-        contenders: files of contenders, see docs/compare.md.
+        contenders: TOML files, each with a scheme and a trigger to compare, see docs/compare.md.
         cases: names of the cases; by default all.
         runs: number of flights of each contender per case and budget.
         quick: whether to fly only a short preliminary comparison.
         weights: file of the weights of the built-in contenders.
-        out: folder for the report; stored flights are not flown again.
+        out: folder for the report; flights that are stored in it are not flown again.
         workers: see `skytether.sweep`.
 
     Returns:
-        For each case, contender and packet budget, the flights at the best threshold; the baseline
-        is left out. Keys: `case`, `contender`, `budget` [1/s], `threshold`, `report`.
+        For each case, contender and packet budget, the flights with the contender's best threshold.
+        The baseline without packets is left out. Their `keys` are `case`, `contender`, `budget`
+        [packets/s], `threshold` and `report`.
 
     Raises:
         ConfigError: a contender or an argument is invalid, or `out` contains another comparison.

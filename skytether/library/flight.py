@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from skytether.explain.explanation import Explanation
 
 PARTS = ("client", "server", "netem", "plan")
-"""Parts of a record: rows of the vehicle's and the server's steps, of packets, and of plans."""
+"""Parts of a record: the vehicle's steps, the server's steps, packets, and plans."""
 QUIET_S = 2.0
-"""Time after which a progress bar is shown [s]."""
+"""Duration of `Flight.explain` after which it shows a progress bar [s]."""
 UNITS = MappingProxyType({"m": "m", "mps": "m/s", "s": "s", "ns": "ns", "bytes": "B"})
-"""Unit of an array, by the last word of its name; other arrays have no unit."""
+"""Unit by the last word of an array's name; arrays with other last words have no unit."""
 
 
 class Column(NamedTuple):
@@ -59,8 +59,8 @@ class Flight:
     """Result of a flight, flown just now or loaded from a recording.
 
     `flight["position_m"]` is an array with a row for each step of the vehicle; a vector has the
-    shape (steps, axes). Names of arrays of the server, netem and the plans begin with that part, as
-    in `flight["server.event"]`. `print(flight)` lists all arrays with shape and unit. Arrays are
+    shape (steps, axes). Names of the other arrays begin with `server.`, `netem.` or `plan.`, as in
+    `flight["server.event"]`. `print(flight)` lists all arrays with shape and unit. Arrays are
     read-only.
     """
 
@@ -78,7 +78,7 @@ class Flight:
         parts |= {part: rows for part in PARTS if len(rows := getattr(record, part))}
         events = tuple(each._replace(host=each.process) for each in record.events)
         self.record = replace(record, **parts, events=events)
-        """Record as written: rows of each part as numpy structured arrays."""
+        """Record of the flight, which has each part as a numpy structured array."""
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """Array of this name.
@@ -129,18 +129,18 @@ class Flight:
 
     @property
     def failure(self) -> Failure | None:
-        """Event because of which the vehicle could not fly to the end; None if it could."""
+        """Event that ended the flight early; None if the vehicle flew to the end."""
         return self.record.failure
 
     @extras.named()
     def explain(self, at: float | None = None, *, seeds: int = 0) -> "Explanation":
-        """Explain why the vehicle braked or was far off, and what would have prevented it.
+        """Explain why the vehicle braked or was far from its reference, and how to prevent this.
 
-        The flight, which must be in virtual time, is flown again up to a hundred times, see
-        docs/explain.md. A progress bar is shown if stderr is a terminal.
+        The flight must have been flown in virtual time. It is flown again up to a hundred times,
+        see docs/explain.md. A progress bar is shown if stderr is a terminal.
 
         Args:
-            at: time of the moment to explain, counted as in `events` [s]; by default the gravest.
+            at: time of the moment to explain, as in `events` [s]; by default the gravest moment.
             seeds: number of other seeds with which each remedy is flown.
 
         Raises:
@@ -182,7 +182,7 @@ class Flight:
         """Picture of the flight: the path over the reference, and the packets in each second.
 
         Args:
-            ax: matplotlib axes for the path alone; without `ax`, both are drawn in a new figure.
+            ax: matplotlib axes for the path only; without them, path and packets in a new figure.
 
         Raises:
             FlightError: no step was flown.
@@ -197,10 +197,11 @@ class Flight:
 
     @extras.named()
     def to_pandas(self, part: str = "client") -> "pandas.DataFrame":
-        """Table of a part; a column for each number, with the axis and the unit in the name.
+        """Table of a part of the record, a column for each number; its name has axis and unit.
 
         Args:
-            part: "client" for the vehicle's steps, "server", "netem" for packets, or "plan".
+            part: "client" for the vehicle's steps, "server" for the server's steps, "netem" for
+                packets, or "plan" for plans.
 
         Raises:
             ExtraMissing: pandas is not installed.

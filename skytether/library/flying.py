@@ -33,8 +33,8 @@ def load(scenario: Given, /, **keys: Any) -> Scenario:
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
-        keys: keys of the scenario and their values. A dot separates table and key, as in TOML. A
-            mapping replaces the keys that it contains.
+        keys: keys of the scenario and their values. A dot separates table and key, as in TOML. If
+            the value is a mapping, it replaces only the keys that it contains.
 
     Raises:
         ConfigError: the scenario or a key does not exist, or a value cannot be flown.
@@ -47,7 +47,7 @@ def check(scenario: Scenario | Mapping[str, Any], /, **keys: Any) -> Scenario:
     """Check every value of a scenario made by hand, and return the scenario.
 
     Args:
-        scenario: a `Scenario`, or its tables as mappings, as in a TOML file.
+        scenario: a `Scenario`, or a mapping with the tables and keys of a TOML file.
         keys: see `load`.
 
     Raises:
@@ -76,20 +76,20 @@ def fly(
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
-        udp: whether server, netem and client fly as three processes on loopback, in real time.
+        udp: whether server, netem and client run as three processes on loopback, in real time.
         secure: whether the link is encrypted, with keys made for this flight.
-        server: endpoint in place of Skytether's server, only in virtual time; each flight needs a
-            new one.
-        planner: class that plans in place of the MPC, see `skytether.plugin.Planner`; only in
-            virtual time. A class decorated by `@planner` can also be given by its name, as
-            `control.planner`.
+        server: endpoint that replaces Skytether's server, only in virtual time. Each flight needs a
+            new endpoint.
+        planner: class that plans instead of the MPC, see `skytether.plugin.Planner`; only in
+            virtual time. Alternatively, the key `control.planner` names a class decorated by
+            `@planner`.
         keys: see `load`.
 
     Returns:
         The flight. If the vehicle could not fly, `Flight.failure` says why.
 
     Raises:
-        ConfigError: the scenario cannot be flown, or not with these arguments.
+        ConfigError: the scenario cannot be flown, or cannot be flown with these arguments.
         FlightError: one of the three processes failed.
         TypeError: an argument is of another type.
     """
@@ -110,18 +110,18 @@ def fly(
 
 @extras.named()
 def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Flight]:
-    """Fly a scenario in virtual time for all seeds together, several times faster than with `fly`.
+    """Fly a scenario in virtual time once for each seed, all flights together.
 
-    Each flight equals that of `fly` with the same seed, to the last bit, but plans are not
-    recorded.
+    This is several times faster than `fly`. Each flight equals the flight of `fly` with the same
+    seed, to the last bit, but plans are not recorded.
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
-        seeds: different seeds that replace the scenario's, as in `range(100)`.
+        seeds: seeds of the flights, all different, as in `range(100)`.
         keys: see `load`.
 
     Raises:
-        ConfigError: the scenario cannot be flown, or not with one of these seeds.
+        ConfigError: the scenario cannot be flown, or a seed is invalid or occurs twice.
         TypeError: an argument is of another type.
     """
     name, flown = named(scenario, keys)
@@ -140,8 +140,8 @@ def fly_batch(scenario: Given, seeds: Iterable[int], /, **keys: Any) -> list[Fli
 
 
 def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
-    """Name of a scenario, and the scenario with keys replaced; a scenario made by hand has its
-    title as name.
+    """Name of a scenario, and the scenario with keys replaced. The name of a `Scenario` is its
+    title.
     """
     plugins.load()  # plug-ins of installed packages, once per process
     if isinstance(scenario, Scenario):
@@ -156,8 +156,8 @@ def named(scenario: Given, keys: Mapping[str, Any]) -> tuple[str, Scenario]:
 
 
 def prepare(*scenarios: Scenario) -> None:
-    """Compile the kernels that these scenarios call, or without scenarios the kernels of all
-    schemes, unless they are on disk already; prints a note on stderr.
+    """Compile the kernels that these scenarios call, unless their machine code is on disk. Without
+    scenarios, compile the kernels of all schemes. A note on stderr reports the compilation.
     """
     import skytether.sim.flight  # noqa: F401 - its kernels are those of every flight
     from skytether.server.schemes import loading
@@ -202,7 +202,7 @@ def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
 
 
 def _planner(planner: Callable[..., Planner], *, udp: bool) -> str:
-    """Name of a planner in scenarios; adds the planner to the table if it is missing.
+    """Name of a planner class in the table PLANNERS, to which a missing class is added.
 
     Raises:
         ConfigError: the flight is over UDP, or another planner has this name.
@@ -236,7 +236,7 @@ def _over_udp(scenario: Scenario, *, secure: bool) -> Record:
         ThreadPoolExecutor(1) as pool,
         ExitStack() as stack,
     ):
-        # After Ctrl-C the processes end in order before the exception is raised again.
+        # After Ctrl-C the processes are asked to end, before the exception is raised again.
         stack.callback(stopped.set)
         flying = pool.submit(
             processes.run,

@@ -11,7 +11,7 @@ import skytether
 
 @pytest.fixture(name="bad_network")
 def _bad_network() -> "Iterator[Callable[..., skytether.bad_network]]":
-    """Function with the arguments of `skytether.bad_network`, which runs until the test ends."""
+    """Function that opens a `skytether.bad_network`, with its arguments, until the test ends."""
     with ExitStack() as networks:
 
         def opened(*network: str, **options: Any) -> "skytether.bad_network":

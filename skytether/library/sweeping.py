@@ -24,19 +24,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Swept:
-    """One combination of a sweep's values, or one point of a comparison, and its flights."""
+    """Flights of one combination of a sweep's values, or of one contender at one packet budget."""
 
     keys: Mapping[str, Any]
-    """Value of each key of the grid; for a comparison see `skytether.compare`."""
+    """Value of each swept key. `skytether.compare` lists the keys of a comparison."""
     scenario: Scenario
-    """Scenario that was flown, with the first of the seeds."""
+    """Scenario of the flights, with the seed of the first flight."""
     runs: tuple[Summary, ...]
-    """Summary of each flight, by seed."""
+    """Summaries of the flights, in the order of their seeds."""
 
     def mean(self, figure: str) -> Estimate:
         """Mean of a figure over the flights, and half the width of its 95 % confidence interval.
 
-        The mean is None if no flight has the figure, the interval if fewer than two flights do.
+        The mean is None if no flight has the figure; the half-width, if fewer than two have it.
 
         Raises:
             KeyError: `figure` is not a numeric figure of a summary.
@@ -47,9 +47,9 @@ class Swept:
 
     @extras.named()
     def to_pandas(self) -> "pandas.DataFrame":
-        """Table with a row for each flight, and the keys of the grid in the first columns.
+        """Table with a row for each flight.
 
-        The other columns are those of `skytether.table`.
+        The first columns are the swept keys, the other columns are those of `skytether.table`.
 
         Raises:
             ExtraMissing: pandas is not installed.
@@ -68,17 +68,17 @@ def sweep(
     workers: int = 1,
     **keys: Any,
 ) -> list[Swept]:
-    """Fly every combination of some keys' values in virtual time, several times each.
+    """Fly every combination of the swept keys' values in virtual time, each with several seeds.
 
         skytether.sweep("demo", {"control.trigger": ["always", "cost_gap"]}, runs=20)
 
     Args:
         scenario: name of a scenario, path of a .toml file, or a scenario.
-        grid: values of each key that is swept; the last key changes fastest.
-        runs: number of flights of each combination, with seeds that count up from the scenario's.
+        grid: values of each swept key; in the result, the last key's value changes fastest.
+        runs: number of flights of each combination; seeds count up from the scenario's seed.
         workers: number of processes that fly; with 1, the calling process flies. With more, a
-            script needs `if __name__ == "__main__":`, as with `multiprocessing`. The number does
-            not affect results.
+            script needs `if __name__ == "__main__":`, as with `multiprocessing`. The results do not
+            depend on the number of processes.
         keys: see `skytether.load`.
 
     Raises:
@@ -96,7 +96,7 @@ def sweep(
     if workers == 1:
         results = list(map(lab.fly, tasks))
     else:
-        # A forked child could inherit a lock that is never released.
+        # Not forked, because a forked child could inherit a lock that is never released.
         spawned = multiprocessing.get_context("spawn")
         with ProcessPoolExecutor(workers, spawned) as pool:
             results = list(pool.map(lab.fly, tasks))
@@ -114,7 +114,7 @@ def sweep(
 
 def _items(grid: Mapping[str, Iterable[Any]]) -> Iterable[tuple[str, Iterable[Any]]]:
     if not isinstance(grid, Mapping):
-        raise TypeError(f"grid: got {grid!r}, expected lists of values by their keys")
+        raise TypeError(f"grid: got {grid!r}, expected a mapping from keys to lists of values")
     return grid.items()
 
 

@@ -4,8 +4,8 @@ A frame begins with 0xFD (MAVLink 2) or 0xFE (MAVLink 1), and has its length and
 that fit no frame are skipped one at a time, so a truncated frame does not lose the frames after it.
 
 The checksum includes a byte that depends on the type of the message. PX4 sends several frames a
-second of types that the dialect lacks. A frame counts as such a frame if its checksum fits with any
-value of this byte; that is also true of one damaged frame in 256.
+second of types that the dialect lacks. A frame counts as a frame of such a type if its checksum is
+right for some value of this byte. The checksum of one in 256 damaged frames is right, too.
 """
 
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 from skytether.mavlink.dialect import dialect
 
 Message = Any
-"""pymavlink's message, which is untyped: its fields are its attributes."""
+"""Message of pymavlink, whose attributes are the message's fields, without types."""
 
 FRAME_BYTES_MAX = 280
 """Longest frame [B]: 10 of header, 255 of payload, 2 of checksum and 13 of signature."""
@@ -24,8 +24,8 @@ class Codec:
     """Encoder and decoder of frames, for one end of a link.
 
     Args:
-        stream: whether frames may come in pieces, as over a serial line or TCP; a datagram has
-            whole frames.
+        stream: whether frames may arrive in pieces, as over a serial line or TCP. Over UDP, a
+            datagram contains only whole frames.
     """
 
     def __init__(self, system: int, component: int, *, stream: bool = False) -> None:
@@ -45,7 +45,7 @@ class Codec:
         return bytes(frame)
 
     def decode(self, data: bytes) -> list[Message]:
-        """Messages in some bytes, in order; never raises."""
+        """Messages in received bytes, in their order. Invalid bytes raise no exception."""
         waiting = self._rest + data
         messages, at, end = [], 0, len(waiting)
         while at < end:
@@ -78,7 +78,7 @@ class Codec:
 def _length(data: bytearray, at: int) -> int:
     """Length of the frame that begins at index `at` [B]; 0 if no frame begins there.
 
-    A truncated header counts as the longest frame.
+    If the header is incomplete, the length of the longest frame is returned.
     """
     remaining = len(data) - at
     if data[at] == 0xFD:
@@ -101,8 +101,8 @@ def _is_unknown(frame: bytes | bytearray) -> bool:
         return False
     ends = (10 if frame[0] == 0xFD else 6) + frame[1]
     wanted = int.from_bytes(frame[ends : ends + 2], "little")
-    # With one more byte, mixed to t, the checksum c becomes (c >> 8) ^ (t << 8) ^ (t << 3) ^ (t >>
-    # 4); the high byte determines t, and the low byte must fit.
+    # One more byte changes the checksum c to (c >> 8) ^ (t << 8) ^ (t << 3) ^ (t >> 4), where t
+    # depends on both. So the high byte of the result determines t, and the low byte must fit.
     mixed = wanted ^ dialect.x25crc(frame[1:ends]).crc >> 8
     t = mixed >> 8 ^ mixed >> 13
     return mixed & 0xFF == (t << 3 ^ t >> 4) & 0xFF

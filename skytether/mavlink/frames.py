@@ -7,6 +7,6 @@ from collections.abc import Sequence
 
 
 def turned(vector: Sequence[float]) -> tuple[float, float, float]:
-    """(north, east, down) to (x north, y east, up), or back; shape (3,)."""
+    """Convert (north, east, down) to (x north, y east, z up), or back; shape (3,)."""
     x, y, z = vector
     return x, y, -z

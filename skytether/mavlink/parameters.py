@@ -1,4 +1,4 @@
-"""Parameter values on the wire: a float, whatever the parameter's type.
+"""Values of parameters in MAVLink messages: floats, even if the parameter is an integer.
 
 ArduPilot converts an integer to a float; PX4 sends the integer's bits as those of a float
 (`MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_C_CAST`, `…_BYTEWISE`).
@@ -29,7 +29,7 @@ def type_of(value: float) -> int:
 
 
 def to_wire(value: float, *, bytewise: bool) -> float:
-    """Float that is sent for a value.
+    """Float by which a MAVLink message represents a parameter's value.
 
     Args:
         value: an int for a parameter of type INTEGER.

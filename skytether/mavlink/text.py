@@ -1,4 +1,4 @@
-"""STATUSTEXT messages: texts of up to 50 bytes; longer texts come in chunks to reassemble."""
+"""STATUSTEXT messages. A text of more than 50 bytes is split into several messages, its chunks."""
 
 from collections import OrderedDict
 
@@ -6,7 +6,7 @@ from skytether.mavlink.codec import Message
 from skytether.mavlink.dialect import dialect
 
 CHUNK_BYTES = 50
-"""Longest text of a message [B]."""
+"""Largest number of bytes of text in one message [B]."""
 UNFINISHED_MAX = 8
 """Largest number of unfinished texts that are kept; a further text replaces the oldest text."""
 CHUNKS_MAX = 8
@@ -33,7 +33,7 @@ def chunks(severity: int, text: str, number: int) -> list[Message]:
 class Texts:
     def __init__(self) -> None:
         self._begun: OrderedDict[tuple[int, int, int], list[str]] = OrderedDict()
-        """Chunks so far of each text, by system, component and text id."""
+        """Received chunks of each unfinished text, by system id, component id and text id."""
 
     def take(self, message: Message) -> str | None:
         """Text completed by a message; None if chunks are missing."""

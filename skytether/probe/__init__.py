@@ -6,6 +6,6 @@
     recorded          measurements from logs of ping and similar programs
     outcome           results as figures and as text for a scenario
 
-The command is `skytether.cli.probe`. The package imports `shared`, the
-client's `ClientLink`, and the server's gate, which answers only verified addresses.
+The command is in `skytether.cli.probe`. The package imports `shared`, the client's `ClientLink`,
+and the server's gate, which answers only verified addresses.
 """

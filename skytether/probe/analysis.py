@@ -1,20 +1,22 @@
 """Analysis of packets in both directions, with functions of arrays.
 
-Clocks: in one direction an apparent delay is the true delay plus the clocks' offset, t_receiver -
-t_sender = d + o(t); in the other it is d - o(t). With o(t) = o + s t, a line through the smallest
-delays of a direction has the slope s, or -s. Following Moon, Skelly and Towsley (1999), the line is
-the one with the highest mean among all lines below the points; both directions share one slope. The
-height of a point above the line is its delay beyond the least delay. Only the sum of the two least
-delays can be measured, because the offset cancels in it; each direction is assumed to have half.
+Clocks: a packet's apparent delay, time of arrival on the receiver's clock minus time of sending on
+the sender's clock, is d + o(t) from the prober to the listener and d - o(t) back. Here d is the
+true delay and o(t) = o + s t the offset of the listener's clock. So a line below the points (time,
+apparent delay) has the slope s in one direction and -s in the other. Following Moon, Skelly and
+Towsley (1999), the line is the one with the highest mean among all lines below the points, with one
+s for both directions. The height of a point above the line is the packet's delay minus the least
+delay. Only the sum of both directions' least delays can be measured, because the offset cancels
+only in the sum; each direction is assumed to have half of the sum.
 
-Loss: the confidence interval is Wilson's, for the effective number of independent packets.
+Loss: the confidence interval is Wilson's, with the effective sample size as number of packets.
 
 Rate: packets of a train are sent at once and leave a bottleneck at intervals of size / rate (packet
 dispersion). So the i-th packet of a train has the delay of a packet sent alone, plus i size / rate.
-The time size / rate is estimated in two ways, and the estimate with the smaller error is used. One
-is the common slope of lines through delay over place in the train, which slowly varying delays
-hardly affect. The other is the maximum-likelihood time, given the measured distribution of delays
-of packets sent alone, which is better for delays that vary fast.
+The time size / rate is estimated in two ways, and the estimate with the smaller error is used. The
+first estimate is the common slope of lines through the delays over the places in the train; delays
+that vary slowly hardly affect it. The second is the maximum-likelihood estimate, given the measured
+distribution of the delays of packets sent alone; it is better if delays vary fast.
 """
 
 from collections.abc import Callable
@@ -29,26 +31,27 @@ from skytether.shared.base.units import HEADER_BYTES, MILLISECOND_NS, SECOND_NS
 from skytether.shared.law.model import Array, Flags
 
 DRIFT_MAX = 500e-6
-"""Largest plausible drift between two clocks: the fastest rate at which clocks are slewed."""
+"""Largest plausible drift between two clocks, as a relative rate: the fastest rate of slewing a
+clock."""
 WINDOWS = 12
-"""Number of parts of a measurement; their least delays give the drift's uncertainty."""
+"""Number of parts of a measurement whose least delays give the drift's standard error."""
 CERTAIN = 5.0
-"""Number of standard errors above which a drift is significant; large, because of few WINDOWS."""
+"""Number of standard errors above which a drift is significant; large, because WINDOWS is small."""
 Z95 = 1.959963984540054
 """Quantile of the standard normal distribution for a two-sided 95 % interval."""
 ALIKE_S = 50e-6
-"""Standard deviation below which values count as equal [s]."""
+"""Standard deviation below which values count as equal, and least width of a kernel [s]."""
 LAGS = 20
 TOGETHER_NS = 2 * MILLISECOND_NS
-"""Longest time for sending the packets of a train [ns]."""
+"""Packets sent later than this after the first of their train are ignored for the rate [ns]."""
 SPREAD_MIN_S = 1e-3
-"""Spread of arrivals above which a train indicates a finite rate, not a busy machine [s]."""
+"""Shortest spread of a train's arrivals that indicates a bottleneck, not a busy machine [s]."""
 ARRIVED_MIN = 4
-"""Smallest number of received packets for a train to count."""
+"""Smallest number of received packets of a train that is used for the rate."""
 GROUPS_MIN, GROUPS_MAX = 4, 10
-"""Number of groups of trains for the jackknife error of the time per packet."""
+"""Smallest and largest number of groups of trains for a jackknife error."""
 ALONE_MIN, KERNELS = 100, 500
-"""Smallest number of packets for a density estimate, and largest number of its kernels."""
+"""Smallest number of delays for a density estimate, and largest number of its kernels."""
 QUANTILES = (0.0, 0.05, 0.25, 0.5, 0.75, 0.95, 0.99, 0.999, 1.0)
 
 
@@ -64,7 +67,8 @@ class Clocks:
     least_sum_s: float
     """Sum of the two directions' least delays [s]."""
     doubt_s: float
-    """Largest error of one-way delays [s]: half of `least_sum_s`, minus known fixed times."""
+    """Largest error of one-way delays [s]: half of `least_sum_s` without both bottlenecks'
+    transmission times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +136,8 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
 
 
 def delays_of_log(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
-    """Clocks, and delays of a log, which has one series of delays on one clock for both directions.
+    """Clocks and delays of a log. Its single series of delays, on one clock, is used for both
+    directions.
 
     Raises:
         ValueError: fewer than two packets arrived.
@@ -156,14 +161,16 @@ def _alone(way: Way, time_s: Array, delay_s: Array, found: BottleneckRate | None
 
 
 def _drift(x_down: Array, y_down: Array, x_up: Array, y_up: Array) -> tuple[float, float]:
-    """Slope of both lines, and its standard error; an insignificant slope is set to 0."""
+    """Drift of the listener's clock and its standard error. A drift that is not significant is set
+    to 0.
+    """
     if x_down[-1] - x_down[0] <= 0.0:
         return 0.0, DRIFT_MAX
     down, up = lower_hull(x_down, y_down), lower_hull(x_up, y_up)
     mean = float(np.mean(x_down)), float(np.mean(x_up))
 
     def height(slope: float) -> float:
-        """Sum of both lines' mean heights, each just below its points; concave in the slope."""
+        """Sum of both lines' mean heights, each line just below its points; concave in `slope`."""
         below = float(np.min(down[1] - slope * (down[0] - mean[0])))
         return below + float(np.min(up[1] + slope * (up[0] - mean[1])))
 
@@ -230,16 +237,16 @@ def highest(function: Callable[[float], float], low: float, high: float, steps: 
 
 
 def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Array, Array]:
-    """Mean time between packets by lag [s], and the correlation of their values.
+    """For each lag, the mean time between two packets [s], and the correlation of their values.
 
-    Pairs with a gap between them, such as those around a train, are left out.
+    Pairs of packets with a gap between them, such as the pairs around a train, are left out.
 
     Args:
         time_s: times of sending, in the order of sending; shape (n,).
         values: value of each packet, NaN if unknown; shape (n,).
 
     Returns:
-        two arrays of shape (lags,), with fewer entries if there are few packets.
+        Two arrays of shape (lags,), shorter if there are few packets.
     """
     centred = values - np.nanmean(values)
     variance = float(np.nanmean(centred**2))
@@ -257,9 +264,9 @@ def autocorrelation(time_s: Array, values: Array, lags: int = LAGS) -> tuple[Arr
 
 
 def effective(count: int, correlations: Array) -> float:
-    """Effective sample size: number of independent values that would determine a mean equally well.
+    """Effective sample size: number of independent values whose mean would have the same variance.
 
-    The sum over lags ends where the correlation no longer differs significantly from 0.
+    Correlations are summed up to the first lag whose correlation is not significantly above 0.
     """
     certain = 2.0 / sqrt(max(count, 1))
     lasting = 0.0
@@ -281,7 +288,7 @@ def correlation_time_s(apart_s: Array, correlations: Array, count: int) -> float
 
 
 def wilson(share: float, count: float) -> tuple[float, float]:
-    """Wilson's 95 % confidence interval of a share, estimated from this number of independent
+    """Wilson's 95 % confidence interval of a share that was measured in `count` independent
     packets.
     """
     if count <= 0.0:
@@ -316,8 +323,8 @@ def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
     """Rate of the bottleneck of a path; None if the packet trains give no finite rate.
 
     Args:
-        delay_s: delays of all packets, with any constant offset; delays of lost packets are
-            ignored [s]; shape (n,).
+        delay_s: delays of all packets, to which any constant may be added [s]; delays of lost
+            packets are ignored; shape (n,).
         size: UDP payload of each packet [B].
     """
     trains = []
@@ -343,11 +350,11 @@ def rate(way: Way, delay_s: Array, size: int) -> BottleneckRate | None:
 
 
 Trains = list[tuple[Array, Array]]
-"""Places in the train, from 0, and delays [s] of the received packets, for each train."""
+"""For each train, the places of the received packets in the train, from 0, and their delays [s]."""
 
 
 def _slope(trains: Trains) -> tuple[float, float]:
-    """Common slope of lines through all trains, each with an intercept, and its standard error."""
+    """Common slope of lines through the trains with own intercepts, and its standard error [s]."""
     centred = [(x - x.mean(), y - y.mean()) for x, y in trains]
     sxx = sum(float(x @ x) for x, _ in centred)
     slope = sum(float(x @ y) for x, y in centred) / sxx
@@ -357,11 +364,11 @@ def _slope(trains: Trains) -> tuple[float, float]:
 
 
 def _likeliest(trains: Trains, alone: Array, first: float, doubt: float) -> tuple[float, float]:
-    """Most likely transmission time of a packet [s], and its jackknife standard error over trains.
+    """Most likely transmission time of a packet, and its jackknife standard error [s].
 
     Args:
         alone: sorted delays of packets that were sent alone [s].
-        first, doubt: initial estimate of the time, and its standard error [s].
+        first, doubt: initial estimate of the transmission time, and its standard error [s].
     """
     count = min(len(alone), KERNELS)
     kernels = np.quantile(alone, (np.arange(count) + 0.5) / count)

@@ -1,10 +1,10 @@
 """Models of delay and loss, as in `skytether list impairments`, fitted to a measurement.
 
-Models are fitted by maximum likelihood and compared by BIC, k ln n - 2 ln L with k parameters,
-where n is the effective sample size, see `analysis.effective`. Likelihoods are densities with a
-time resolution of RESOLUTION_S: the normal error of the paper's slots is at least RESOLUTION_S, and
-so is the distance of delays from a distribution's lower bound. Delays that hardly vary are called
-constant.
+Models are fitted by maximum likelihood, and compared by the Bayesian information criterion (BIC) k
+ln n - 2 ln L: k is the number of parameters, L the likelihood, and n the effective sample size, see
+`analysis.effective`. Widths of distributions, and distances of delays from a distribution's lower
+bound, are at least RESOLUTION_S, so that no likelihood is infinite. Delays with a standard
+deviation of at most CONSTANT_S are modelled as constant.
 """
 
 from collections.abc import Callable
@@ -19,17 +19,17 @@ from skytether.shared.law.model import Array, Flags
 
 RESOLUTION_S = 50e-6
 CONSTANT_S = 0.5e-3
-"""Largest standard deviation of delays that are called constant [s]."""
+"""Largest standard deviation of delays that are modelled as constant [s]."""
 LEASTS = 60
 """Number of candidates for a delay distribution's lower bound."""
 SLOTS = 4000
 """Number of slot lengths that are tried for the paper's distribution."""
 COLUMNS = 50
-"""Number of neighbouring slot lengths that are tried together; a divisor of SLOTS."""
+"""Number of columns of the table of slot lengths that are tried; a divisor of SLOTS."""
 PAIRS_MIN = 20
 """Smallest number of packets for a fit."""
 BURST_MIN, BURST_MAX_S = 0.1, 3600.0
-"""Bounds of a channel's redraw time: lower, in mean times between packets, and upper [s]."""
+"""Bounds of the mean redraw time: lower in median times between packets, upper in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,7 +131,7 @@ def _gamma(delay_s: Array, least_s: float) -> tuple[float, float, float]:
 
 
 def _paper(delay_s: Array) -> Found | None:
-    """Fit a least delay plus a Poisson number of slots, with a normal error; None without slots."""
+    """Fit least delay, Poisson number of slots and normal error; None if no slots are found."""
     first, span = float(delay_s.min()), float(delay_s.max() - delay_s.min())
     if span < 20.0 * RESOLUTION_S:
         return None
@@ -151,7 +151,7 @@ def _paper(delay_s: Array) -> Found | None:
     good = np.flatnonzero(scores > max(0.9 * float(scores.max()), 0.8))
     if not len(good):
         return None
-    # A fraction of the true slot length scores as high: take the longest of the best lengths.
+    # Half or a third of the true slot length scores as high: the longest of the best is taken.
     run = good[: int(np.argmax(np.diff(good, append=10**9) > 1)) + 1]
     peak = inverse[run[np.argmax(scores[run])]]
     step = inverse[1] - inverse[0]
@@ -183,12 +183,12 @@ def _paper(delay_s: Array) -> Found | None:
 
 
 def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
-    """Fit models of losses; the best is first; empty if nothing or everything was lost.
+    """Fit models of losses; the best is first. Empty if no packet or every packet was lost.
 
-    The channel of `gilbert_elliott` is redrawn at random moments, bad with probability `share`, and
-    loses every packet while it is bad. With probability exp(-Δt / cell) the channel is not redrawn
-    between two packets, a time Δt apart; `cell` is the mean time from one redraw to the next. A bad
-    period lasts cell / (1 - share) on average.
+    In `gilbert_elliott`, the channel is redrawn at random times: it is bad with probability
+    `share`, and loses every packet while it is bad. With probability exp(-Δt / cell) it is not
+    redrawn between two packets that are Δt apart; `cell` is the mean time from one redraw to the
+    next [s]. A bad period lasts cell / (1 - share) on average.
 
     Args:
         time_s: times of sending, in the order of sending; shape (n,).
@@ -220,24 +220,24 @@ def fit_losses(time_s: Array, lost: Flags) -> list[FittedImpairment]:
 
 
 def _at_share(likelihood: Callable[[float, float], float], share: float, cell: float) -> float:
-    """Log-likelihood of a share; `cell` is the logarithm of the redraw time."""
+    """Log-likelihood of a redraw time at a given share; `cell` is the time's logarithm."""
     return likelihood(share, exp(cell))
 
 
 def _at_cell(likelihood: Callable[[float, float], float], cell_s: float, share: float) -> float:
-    """Log-likelihood of a redraw time `cell_s` [s] at a given share."""
+    """Log-likelihood of a share at a given redraw time `cell_s` [s]."""
     return likelihood(share, cell_s)
 
 
 _TURNS = ((True, True), (True, False), (False, True), (False, False))
-"""Whether a packet was lost, and whether the next packet was lost."""
+"""Four cases: whether a packet was lost, and whether the packet after it was lost."""
 
 
 def _gilbert(groups: list[Array], share: float, cell_s: float) -> float:
     """Log-likelihood of the packets' losses, each given whether the previous packet was lost.
 
     Args:
-        groups: times between two packets, by the four cases in `_TURNS` [s].
+        groups: times between successive packets [s], for each of the four cases in `_TURNS`.
     """
     total = 0.0
     for (before, after), between in zip(_TURNS, groups, strict=True):

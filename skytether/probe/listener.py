@@ -1,13 +1,13 @@
 """Listening end of a measurement: answers each probe with one packet, at most as long as the probe.
 
 An answer has the listener's time and a list of arrivals that the prober has not acknowledged, the
-oldest first, so that no arrival is lost with an answer. The probes of a train are answered together
-once all have arrived, so that the answers form a train as well.
+oldest first. So if an answer is lost, a later one repeats its arrivals. The probes of a train are
+answered together once all have arrived, so that the answers form a train as well.
 
 A HELLO creates no state: its session id is derived from a secret and the sender's address. The
-first PROBE creates state; only a sender that receives packets at its address can send it. Without
-keys, answers go only to that address: otherwise anybody who has seen the session id could direct
-answers at a third party. With keys a sender may change its address.
+first PROBE with this id creates state. Only a sender that has received the WELCOME at its address
+knows the id. Without keys, answers go only to this address: otherwise anybody who has seen the
+session id could direct answers at a third party. With keys a sender may change its address.
 """
 
 import hashlib
@@ -36,7 +36,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Largest number of measurements at once; for a further one, `Listener._gives_way` ends another."""
+"""Largest number of simultaneous measurements; `Listener._gives_way` makes room for another."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
@@ -66,7 +66,7 @@ class ProbeSession:
     host: str
     logged: int = 0
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
-    """Newest arrivals not yet acknowledged by the prober: number and time [ns]."""
+    """Newest arrivals not yet acknowledged by the prober: number of the PROBE, and time [ns]."""
     train: list[HeldPacket] = field(default_factory=list)
     """Received packets of a train, answered once the rest has arrived."""
     train_ns: int = 0
@@ -118,11 +118,11 @@ class Listener(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_SERVER)
 
     def _session(self, name: bytes, call: GateCall, peer: Address, now_ns: int) -> ProbeSession:
-        """Measurement with the session id `name`, begun if it is new.
+        """Measurement with the session id `name`; created if there is none.
 
         Raises:
             ProtocolError: the session id is wrong for this sender, or SESSIONS_MAX sessions are
-                open.
+                open and none may be ended.
         """
         session = self._sessions.get(name)
         if session is None or call.vehicle is None:
@@ -141,10 +141,11 @@ class Listener(Endpoint):
         return session
 
     def _gives_way(self, peer: Address, now_ns: int) -> bytes | None:
-        """Id of the session to end in favour of a new sender's session; None if none may be ended.
+        """Id of the session to end for a new sender's session; None if no session may end.
 
-        A host with many sessions cannot block others: for a host with fewer sessions, the oldest
-        session of the host with the most sessions is ended.
+        A session without a probe for IDLE_NS is the first to end. Otherwise the host with the most
+        sessions loses its oldest one, if the sender's host has at least two fewer. So no host can
+        block others.
         """
         name, session = next(iter(self._sessions.items()), (None, None))
         if session is None or now_ns - session.heard_ns > IDLE_NS:

@@ -1,9 +1,9 @@
 """Outages of paths that were measured at the same time, and outages that they have in common.
 
-T is OUTAGE_S, or SPARSE times the typical time between two probes if that is longer. A probe fails
-without an answer within T. A path is out from the first of consecutive failed probes until the next
+T is OUTAGE_S or, if longer, SPARSE times the median time between two probes. A probe fails if no
+answer arrives within T. A path is out from the first of consecutive failed probes until the next
 answered probe, if the failed probes cover at least T. A probe covers the time until the next probe,
-but at most SPARSE typical times, because no probes are sent during a train.
+but at most SPARSE times the median, because no probes are sent during a train.
 
     share_k = |out_k and covered| / |covered|        covered: by a probe of every path
     common  = |out_1 and out_2 and ... and covered| / |covered|
@@ -21,11 +21,11 @@ import numpy as np
 from skytether.shared.law.model import Array
 
 OUTAGE_S = 0.5
-"""Shortest outage, and longest round trip of a probe that counts as answered [s]."""
+"""Smallest value of the threshold T, see the module [s]."""
 SPARSE = 2.0
 
 Intervals = Array
-"""Beginnings and ends [s], rising and without overlap; shape (n, 2)."""
+"""Beginning and end of each interval [s], in ascending order, without overlap; shape (n, 2)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +44,7 @@ class RoundTrips:
 
 class OutageFigures(msgspec.Struct, frozen=True):
     share: float
-    """Share of the covered time in which the path, or every path, was out."""
+    """Share of the covered time in which the path was out; in `common`, all paths."""
     count: int
     longest_s: float
 
@@ -53,12 +53,12 @@ class CommonOutages(msgspec.Struct, frozen=True, kw_only=True):
     """Outages of each path, and common outages of all paths."""
 
     threshold_s: float
-    """Time T without an answer after which a path counts as out [s]."""
+    """Longest round trip of an answered probe, and shortest outage: T of the module [s]."""
     seconds: float
     """Time covered by probes of all paths [s]."""
     paths: list[OutageFigures]
     common: OutageFigures
-    """Times at which all paths were out at once."""
+    """Outages of all paths at once."""
     product: float
     """Product of the paths' shares: the common share if the paths are independent."""
 
@@ -87,8 +87,8 @@ def compare(paths: Sequence[RoundTrips]) -> CommonOutages:
 
 
 def common_time(paths: Sequence[RoundTrips]) -> Sequence[tuple[float, float]]:
-    """Beginning and end [s] of the time that all measurements share, counted from the first probe
-    of each path.
+    """For each path, beginning and end of the time that all measurements share [s], counted from
+    this path's first probe.
     """
     begin_s = max(float(path.sent_s[0]) for path in paths)
     end_s = min(float(path.sent_s[-1]) for path in paths)
@@ -104,7 +104,7 @@ def outages(path: RoundTrips, threshold_s: float) -> tuple[Intervals, Intervals]
     """Outages of one path, and the times covered by its probes [s]; shapes (n, 2)."""
     sent_s, most_s = path.sent_s, SPARSE * path.every_s
     ends_s = np.minimum(np.append(sent_s[1:], np.inf), sent_s + most_s)
-    failed = ~(path.trip_s <= threshold_s)  # NaN, no answer, counts as failed
+    failed = ~(path.trip_s <= threshold_s)  # NaN (no answer) counts as failed
     edges = np.diff(failed.astype(np.int8), prepend=0, append=0)
     first, last = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1) - 1
     covered_s = np.append(0.0, np.cumsum(ends_s - sent_s))
@@ -115,7 +115,7 @@ def outages(path: RoundTrips, threshold_s: float) -> tuple[Intervals, Intervals]
 
 
 def overlap(sets: Sequence[Intervals], least: int) -> Intervals:
-    """Times that are in at least `least` of the sets of intervals."""
+    """Intervals of the times that are in at least `least` of the given sets of intervals."""
     at_s = np.concatenate(sets).T.ravel()
     step = np.repeat((1, -1), len(at_s) // 2)
     order = np.lexsort((-step, at_s))  # beginnings first, so that touching intervals are joined

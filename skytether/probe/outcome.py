@@ -17,7 +17,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.telemetry.record import DOWNLINK, PACKET_COLUMNS, UPLINK, Rows
 
 TEXT_CORRELATION_MIN = 0.5
-"""Shortest correlation time that the text states, as a multiple of the time between packets."""
+"""Shortest correlation time in a model's text, as a multiple of the time between packets."""
 ORDERED_SHARE = 0.01
 """A path counts as ordered if no packet was reordered, although independent delays would reorder
 more than this share of the packets."""
@@ -59,14 +59,14 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     rate_high: float | None
     """Bounds of the 95 % interval of the rate [B/s]."""
     trains: int
-    """Number of trains of which enough packets arrived to estimate the rate."""
+    """Number of trains from which the rate was estimated; 0 without a rate."""
     train_wait_s: float
     """Time for which the last packet of a train waits in the bottleneck's queue [s]."""
     delay_models: list[ModelFigures]
-    """Models of the delay without the transmission time at `rate`; the best model is first."""
+    """Models of the delay without the bottleneck's transmission time; the best is first."""
     loss_models: list[ModelFigures]
     text: str
-    """Text of the best models, for `network.uplink` or `network.downlink`."""
+    """Best models of delay and loss as a value of `network.uplink` or `network.downlink`."""
 
 
 class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
@@ -76,15 +76,15 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Address of the other end, or LOCAL=HOST:PORT, or names of the files that were read."""
     secure: bool
     log: Literal["", "round trips", "one way"]
-    """Kind of times in a log; "" for a measurement. Each direction gets half of a round trip."""
+    """Kind of the log's times; "" for a measurement. A direction gets half of a round trip."""
     seconds: float
     bytes: int
-    """UDP payload of a packet [B]; 0 if a log does not contain it."""
+    """UDP payload of a packet [B]; 0 for a log."""
     every_s: float
     offset_s: float
     """Offset of the listener's clock at the first probe [s]."""
     offset_doubt_s: float
-    """Largest error of the offset, and of one-way delays (opposite in both directions) [s]."""
+    """Largest error of the offset and of one-way delays [s]; opposite in the two directions."""
     drift_ppm: float
     """Drift of the listener's clock [10⁻⁶]; 0 if the drift is not significant."""
     drift_doubt_ppm: float
@@ -217,11 +217,11 @@ def _would_reorder(delays: Delays) -> float:
 
 
 def trace(delays: Delays, within_s: tuple[float, float] | None = None) -> str:
-    """Packets of a direction as CSV text for `trace`, one row per packet.
+    """Packets of a direction as CSV text for the impairment `trace`, one row per packet.
 
     Args:
         within_s: beginning and end of the trace [s], by default the first and the last packet's
-            time; the nearest packet outside at each end is moved to that end.
+            time. Of the packets outside, the nearest one at each end is moved to that end.
     """
     lines, last = ["time_s,delay_s,lost"], -np.inf
     times_s, delays_s = delays.time_s, delays.delay_s
@@ -242,9 +242,9 @@ def trace(delays: Delays, within_s: tuple[float, float] | None = None) -> str:
 
 
 def rows(measured: MeasuredPath, clocks: Clocks, path: int = 0) -> Rows:
-    """Packets in netem's format, one row each, including packets of trains.
+    """Packets of both directions as rows of netem's part of a record, including packets of trains.
 
-    Times are on the prober's clock; `delay_ns` of a lost packet is 0. `path` counts from 0.
+    Times are on the prober's clock; `delay_ns` of a lost packet is 0. Paths count from 0.
     """
     parts = []
     for direction, way in ((DOWNLINK, measured.downlink), (UPLINK, measured.uplink)):

@@ -4,8 +4,8 @@
     wait for the last answers has ended
 
 At intervals a train of TRAIN packets is sent at once, to measure the data rate of the path. A train
-takes the time of twice as many probes: if the path is fast enough for the probes, its queues are
-empty again before the next probe, whose delay is that of an idle path.
+of TRAIN packets takes the time of 2 TRAIN probes: if the path is fast enough for the probes, its
+queues are empty again before the next probe, so the train does not delay this probe.
 """
 
 from array import array
@@ -39,20 +39,20 @@ from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 BYTES_MIN = MESSAGE_BYTES_MIN + OVERHEAD_BYTES
 """Smallest size of a probe, encrypted or not [B]."""
 PROBES_MAX = 1_000_000
-"""Largest number of probes: as many as a trace has rows."""
+"""Largest number of probes: the largest number of rows of a trace."""
 TRAIN = 16
 """Number of packets of a train."""
 TRAIN_SLOTS = 2 * TRAIN
-"""Number of grid points that a train takes, in place of one probe at each."""
+"""Number of points of the time grid that a train takes; no other probe is sent at them."""
 TRAIN_EVERY_NS, TRAIN_EVERY_SLOTS = 10 * SECOND_NS, 10 * TRAIN
-"""From one train to the next: shortest time [ns], and smallest number of grid points."""
+"""Shortest time [ns] and smallest number of grid points from one train to the next."""
 HELLO_BYTES = 64
 """Size of an unencrypted HELLO [B]: larger than a WELCOME, against amplification attacks."""
 PATIENCE_NS = 10 * SECOND_NS
 """Longest wait for the first answer [ns]."""
 POLL_NS = 100 * MILLISECOND_NS
 LAST_MIN_NS, LAST_MAX_NS = 1 * SECOND_NS, 60 * SECOND_NS
-"""Shortest and longest wait for the last answers [ns]; between, twice the longest round trip."""
+"""Bounds of the wait for the last answers, which is twice the longest round trip [ns]."""
 
 Longs = NDArray[np.int64]
 
@@ -118,7 +118,7 @@ class Prober(Endpoint):
         self._session = b""
         self._hello = encode(ProbeHello(nonce), 0 if link.secure else HELLO_BYTES)
         self._due_ns: int | None = 0
-        """Time of the next wake [ns]; 0 before the first."""
+        """Time of the next wake [ns]; 0 before the first wake."""
         self._hello_ns = 0
         self._began_ns: int | None = None
         self._zero_ns = 0
@@ -128,7 +128,7 @@ class Prober(Endpoint):
         """Time at which the last probe was sent [ns]; None until the last probe is sent."""
         self._longest_ns = 0
         self.refused = False
-        """Whether the listener has refused a session: SESSIONS_MAX measurements are open."""
+        """Whether the listener has refused a session, because it has too many open measurements."""
         self.failed = False
         self._done = False
         self._sent_ns, self._train = array("q"), array("q")
@@ -178,7 +178,7 @@ class Prober(Endpoint):
             raise ProtocolError(Drop.NOT_FOR_A_CLIENT)
 
     def _learn(self, answer: ProbeAnswer, now_ns: int) -> None:
-        # Without keys an attacker can forge `logged`: more than two arrivals per probe are refused.
+        # Without keys an attacker can forge `logged`, so it may be at most two arrivals per probe.
         if answer.logged > 2 * len(self._sent_ns) or len(self._answer_number) > 2 * PROBES_MAX:
             raise ProtocolError(Drop.FIELD)
         if any(number >= len(self._sent_ns) for number, _ in answer.arrivals):
@@ -340,7 +340,7 @@ class Prober(Endpoint):
         return Way(sent_ns[:end], came_ns[:end], came[:end], train[:end], copies)
 
     def _uplink(self, number: Longs, logged_ns: Longs) -> Way:
-        """Answers to probes. The sending time of a lost answer is the arrival time of its probe."""
+        """Answers to probes. A lost answer has its probe's time of arrival as time of sending."""
         answered = np.array(self._answer_number, np.int64)
         first, at = np.unique(answered[answered < len(number)], return_index=True)
         end = len(number) if self._settled else int(first.max(initial=-1)) + 1

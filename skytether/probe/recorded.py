@@ -1,4 +1,4 @@
-"""Measurements from logs of round-trip times (`shared.formats.recorded`).
+"""Measurements from logs of delays, such as those of ping (`shared.formats.recorded`).
 
 A log has one clock and one series of delays, which is used for both directions.
 """

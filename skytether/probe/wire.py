@@ -160,7 +160,7 @@ def _check(session: bytes, numbers: tuple[int, ...]) -> None:
     """Refuse a session id of wrong length, and numbers out of range.
 
     Raises:
-        ProtocolError: a field is wrong; the message names it.
+        ProtocolError: the session id or a number is invalid.
     """
     wrong = any(isinstance(each, bool) or not 0 <= each <= NO_NUMBER for each in numbers)
     if wrong or len(session) != SESSION_BYTES:

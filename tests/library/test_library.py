@@ -451,7 +451,7 @@ REFUSALS: list[tuple[Callable[[], object], type[Exception], str]] = [
     (
         lambda: sweep("demo", ["seed"]),  # type: ignore[arg-type]
         TypeError,
-        "grid: got ['seed'], expected lists of values by their keys",
+        "grid: got ['seed'], expected a mapping from keys to lists of values",
     ),
     (
         lambda: sweep("demo", {"control.trigger": "always"}),
