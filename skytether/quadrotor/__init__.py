@@ -3,8 +3,8 @@
     velocity → acceleration → attitude → rates → rotors → forces
 
 No module of this package reads a clock or draws unseeded random numbers; the caller advances time.
-It imports `shared.base` and `shared.law`; `client.simulated.quadrotor` flies it for `vehicle.kind =
-"quadrotor"`, and so does the simulated autopilot. Its kernels need the extra `server`.
+The package imports `shared.base` and `shared.law`. `client.simulated.quadrotor` and the simulated
+autopilot fly the quadrotor. The package's kernels need the extra `server`.
 """
 
 from skytether.shared.base import extras

@@ -3,7 +3,9 @@
     ṗ = v      v̇ = g + R F / m      q̇ = q ⊗ (0, Ω) / 2
     J Ω̇ = M - Ω × J Ω      ω̇ = (ω* - ω) / τ
 
-In this package, world vectors are north, east, down, and body vectors forward, right, down. R, the
+p and v are position and velocity, Ω the rates, F and M the rotors' and the air's force and torque
+on the body, J its inertia, ω and ω* the rotors' actual and commanded speeds, and τ their lag. In
+this package, world vectors are north, east, down, and body vectors forward, right, down. R, the
 rotation matrix of the quaternion q, turns body vectors into world vectors.
 """
 
@@ -19,12 +21,12 @@ STATES = 17
 to 12) and rotor speeds (13 to 16).
 """
 STEP_NS = 2_000_000
-"""Step of the body and of its loops [ns]."""
+"""Time step of the equations of motion and of the control loops [ns]."""
 STEP_S = 0.002
 
 
 class Signs(NamedTuple):
-    """Signs of position and torque of rotors front right, back left, front left, back right."""
+    """Signs of rotors' positions and torques: front right, back left, front left, back right."""
 
     front: tuple[float, ...] = (1.0, -1.0, 1.0, -1.0)
     """Position of each rotor along the forward axis: 1 in front, -1 behind."""

@@ -7,8 +7,8 @@
     rotors        rotor forces with that thrust and those torques, from 0 to the largest that the
                   battery's voltage allows
 
-The limits follow ArduPilot's input shaping: the acceleration tracks p (v - v*), or its square root
-for large errors, with p = jerk / acceleration.
+The limits follow ArduPilot's input shaping: a* tracks p (target - v*), or its square root for large
+differences, with p = jerk / acceleration.
 """
 
 from typing import NamedTuple
@@ -45,7 +45,7 @@ class Gains(NamedTuple):
     i_up: float
     """Gain from the integral of the vertical velocity error to acceleration [1/s²]."""
     integral_max: float
-    """Largest acceleration from an integral [m/s²]."""
+    """Largest integral term of the commanded acceleration, on each axis [m/s²]."""
     tilt_max: float
 
 

@@ -91,7 +91,7 @@ class Quadrotor:
         self._air.turbulence[0] = turbulence_mps
 
     def advance(self, velocity: Array, duration_ns: int) -> None:
-        """Fly for a duration; a remainder of less than a step is added to the next duration.
+        """Fly for a duration; a remainder of less than a time step is added to the next duration.
 
         Args:
             velocity: commanded velocity [m/s]; shape (3,).
@@ -115,7 +115,7 @@ class Quadrotor:
     def wanted_position(self) -> Array:
         """Position of the shaped motion, which the control loops track [m]; shape (3,).
 
-        Without a position loop (`Gains.catch_up` 0), the true position.
+        If there is no position loop (`Gains.catch_up` is 0), this is the true position.
         """
         ahead = self._quad.wanted[6:] if self.gains.catch_up else 0.0
         wanted: Array = UP * (self._quad.x[:3] + ahead)

@@ -23,7 +23,7 @@ QUALITY = "::,1:,:,:,,"
 depth of 1."""
 NODE, PUBLISHER, SUBSCRIBER = "NN", "MP", "MS"
 NAME_AT, PARTS = 8, 13
-"""Index of a node's name in a token, and number of parts of a publisher's token."""
+"""Index of the node's name among a token's parts, and number of parts of a publisher's token."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,18 +57,18 @@ class Node:
     publishes: Topic
     subscribes: Topic
     alternatives: tuple[Topic, ...] = ()
-    """The published topic with each further message type that it may have. If there are any, the
-    first message to publish determines the type."""
+    """The published topic with each other message type that it may have. If there are alternatives,
+    the first message to publish determines the type."""
 
     @property
     def forms(self) -> tuple[Topic, ...]:
-        """The published topic, once for each type that it may have. The peer of a message to
-        publish is the topic's name and an index of this list.
+        """The published topic, once for each message type that it may have. A message to publish
+        has as its peer the topic's name and the index of its type in this list.
         """
         return self.publishes, *self.alternatives
 
     def tokens(self, session: str) -> list[str]:
-        """Tokens of the node, its publisher and its subscriber; `session` is Zenoh's identity."""
+        """Tokens of node, publisher and subscriber; `session` is the id of the Zenoh session."""
         subscriber = self._token(session, 2, SUBSCRIBER, self.subscribes)
         return [self._token(session, 0, NODE), self.publisher(session), subscriber]
 

@@ -34,7 +34,7 @@ Rotation = tuple[Vector, Vector, Vector]
 
 
 class MessageError(ValueError):
-    """Bytes are not a message of the expected type, or the message has invalid numbers."""
+    """The bytes are no message of the expected type, or the message has invalid numbers."""
 
 
 class Odometry(NamedTuple):

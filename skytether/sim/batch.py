@@ -54,7 +54,7 @@ def fly_batch(
 
     Each flight equals that of `fly` with the same seed, to the last bit, except that the server's
     `figures` only count dropped datagrams. If the server's computing time exceeds a step, the runs
-    are flown one by one, because the ticks that it misses then depend on its start.
+    are flown one by one, because the ticks that the server misses then depend on its start.
 
     Args:
         seeds: different seeds that replace the scenario's.
@@ -65,7 +65,7 @@ def fly_batch(
         ConfigError: a plug-in raised an exception.
     """
     in_time = seconds_to_ns(scenario.simulation.compute_s) <= scenario.dt_ns
-    # Runs would affect each other: vehicles of one server share its bytes/s, or avoid each other.
+    # Runs would affect each other if vehicles of one server share its bytes/s, or keep apart.
     alone = not in_time or scenario.keeps_apart or scenario.control.shared_bytes_per_s
     company = 1 if alone else COMPANY_MAX
     shared: dict[str, Any] = {"make_server": SharedServer, "figures_of": _dropped}

@@ -19,8 +19,8 @@ def plan(
     flown: Mapping[str, tuple[Endpoint, Scenario]],
     changes: Sequence[tuple[float, Mapping[str, Any]]],
 ) -> None:
-    """Schedule changes of keys at each host that accepts the key; the first host refuses unknown
-    keys.
+    """Schedule each change of a key at all hosts that accept the key. The first host also gets keys
+    that no host accepts, and refuses them.
     """
     running = {host: Running(endpoint, scenario) for host, (endpoint, scenario) in flown.items()}
     changeable = frozenset[str]().union(*(each.changeable for each in running.values()))

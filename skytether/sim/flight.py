@@ -125,13 +125,13 @@ def fly(
         vehicles: number of vehicles, at least 1; all have the same reference, each has its own
             winds.
         secure: whether the link is encrypted, with keys from the seed.
-        server: endpoint in place of `Server`; its steps are not recorded.
+        server: endpoint that replaces `Server`; the endpoint's steps are not recorded.
         standby: whether there is a second server, on the host `standby`, behind a network of its
-            own; or an endpoint in its place, which is not recorded.
+            own; or an endpoint that replaces the second server, and is not recorded.
         beside: endpoints of further hosts by name, such as an autopilot at `vehicle.address`.
-        changes: times [s, counted as in `Record.events`], and the keys and values that change then,
-            as in `shared.endpoints.change`; a refused change is an event, and the flight continues.
-        actions: times [s], and functions that act on the `World` then, for example stop a host.
+        changes: times [s, as in `Record.events`], and the changed keys and values, as in
+            `shared.endpoints.change`; a refused change is an event, and the flight continues.
+        actions: times [s], and functions that then act on the `World`, for example stop a host.
         stopwatch: stopwatch for the server's stages; its times differ from flight to flight.
         on_second: called with the time flown [s], once per second of flight.
         stopped: called every ASK_NS; the flight ends once the result is true.
@@ -239,8 +239,8 @@ class Run:
         """Figures of each process when the last vehicle finished."""
 
     def hear(self, time_ns: int, host: str, event: Event) -> None:
-        """Keep an event, unless the last vehicle of the run has finished; vehicles are numbered
-        from 1.
+        """Store an event with its vehicle's number in the run, from 1, unless the last vehicle of
+        the run has finished.
         """
         if not self.flying:
             return
@@ -392,7 +392,7 @@ def fly_runs(
 
 
 def _tell_time(world: Hosts, hosts: Mapping[str, Endpoint], error_ns: int) -> None:
-    """Give the hosts a time of day, wrong by -`error_ns` and +`error_ns` in turn; no time if 0."""
+    """Give the hosts a time of day, wrong by -`error_ns` and +`error_ns` in turn; none if 0."""
     for number, (host, each) in enumerate(hosts.items() if error_ns else ()):
         wrong_ns = error_ns if number % 2 else -error_ns
         world.act(host, partial(each.learn_time, world.now_ns + wrong_ns, error_ns))

@@ -2,9 +2,9 @@
 
 A datagram takes no time between endpoints; delays come from netem, which is an endpoint too. Every
 host has its own clock, with offset and drift. A host may need computing time when it is woken: its
-datagrams leave at the end of that time, and only then can it be woken again. The host receives
-datagrams meanwhile, so computing for one peer does not delay the datagrams of another peer. A
-`sim.world.World` can stop hosts, too, and saves the state of their endpoints.
+datagrams leave at the end of this time, and before that the host is not woken again. The host
+receives datagrams meanwhile, so computing for one peer does not delay the datagrams of another
+peer. A `sim.world.World` can stop hosts, too, and saves the state of their endpoints.
 
 Time is integer nanoseconds, and events of one instant happen in a fixed order. So equal inputs give
 equal outcomes on every machine, and hosts that exchange no datagrams do not affect each other.
@@ -93,7 +93,7 @@ class Hosts:
             | tuple[int, int, int, None, Callable[[], None]]
         ] = []
         """Heap of future events: time, rank, order of entry, host, and the arriving datagram, or
-        None for a wake; an action has no host, and a function in place of the datagram.
+        None for a wake; an action has None as host, and a function as last entry.
         """
         self._scheduled = 0
         self._look_ns = 0
@@ -170,7 +170,7 @@ class Hosts:
                 entry[4]()
             elif entry[4] is not None:
                 self._receive(entry[3], entry[4])
-            elif entry[3].armed_ns == self.now_ns:  # otherwise the next wake has been changed
+            elif entry[3].armed_ns == self.now_ns:  # otherwise the wake was rescheduled
                 host = entry[3]
                 host.armed_ns = None
                 host.endpoint.wake(now_ns=host.clock.local(self.now_ns))

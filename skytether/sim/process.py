@@ -1,4 +1,4 @@
-"""Processes in virtual time, which can be killed, ended in order, and restarted on their host.
+"""Processes in virtual time, which can be killed, asked to end, and restarted on their host.
 
 Each run is a new endpoint. The host keeps its address, clock and saved state (`World.memory`).
 """
@@ -37,13 +37,13 @@ class VirtualProcess(Generic[Run]):
         world.stop(self.host)
 
     def close(self, world: World) -> None:
-        """End the run at once if it is up, as a second SIGTERM does; sends its last datagrams."""
+        """End the run at once if it is up, as a second SIGTERM does, and send its datagrams."""
         if self.is_up:
             world.act(self.host, self.endpoint.close)
         self.kill(world)
 
     def end(self, world: World, look_ns: int, ended: Callable[[], None] = lambda: None) -> None:
-        """Let the run end in order if it is up, as SIGTERM does.
+        """Ask the run to end if it is up, as SIGTERM does.
 
         Args:
             look_ns: time between two checks whether the run has finished [ns].

@@ -21,7 +21,7 @@ FROZEN_MAX = 6_500
 def changed(clock: Clock, time_ns: int, *, step_ns: int = 0, drift_ppb: int | None = None) -> Clock:
     """Clock after a step of `step_ns` or a change of rate at `time_ns`, a time of the world [ns].
 
-    With `drift_ppb` None the rate stays the same.
+    If `drift_ppb` is None, the rate stays the same.
     """
     drift_ppb = clock.drift_ppb if drift_ppb is None else drift_ppb
     offset_ns = clock.local(time_ns) + step_ns - Clock(0, drift_ppb).local(time_ns)

@@ -44,15 +44,15 @@ class Hypothesis:
     """Number of the theorem's condition; 0 for its conclusion."""
     name: str
     margin: float
-    """Smallest distance from the bound; negative: violated; infinite: the condition never applied;
-    NaN: not checked."""
+    """Smallest distance from the bound [`unit`]. Negative: violated; infinite: the condition never
+    applied; NaN: not checked."""
     unit: str
     vehicles: tuple[int, ...] = ()
     """Vehicle or pair of vehicles with the smallest margin."""
     step: int | None = None
     """Step of the smallest margin, as counted by the first of `vehicles`."""
     checked: float = 1.0
-    """Share of the steps or motions that the record suffices to check; 0 for a hypothesis that is
+    """Share of the steps or motions that could be checked from the record; 0 if the hypothesis is
     checked by a counter."""
 
     @property
@@ -119,7 +119,7 @@ class Flown:
 
     @property
     def off_m(self) -> Array:
-        """Distance from the motion in force [m]; NaN without one, or where it is unrecorded."""
+        """Distance from the motion in force [m]; NaN if no recorded motion is in force."""
         if not len(self.motions.step):
             return np.full(len(self.step), np.nan)
         stage = self.step - self.in_force
@@ -264,7 +264,7 @@ def _acceptance(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
 
 
 def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that motions are flown to their end; margin: time in force beyond the end."""
+    """Check that motions are flown to their end; the margin is the time in force beyond the end."""
     margins = {}
     for each in vehicles:
         left = each.changed[each.in_force[each.changed] < 0]
@@ -280,7 +280,7 @@ def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothes
 
 
 def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that the server observed all vehicles before one moved; margin: the time between."""
+    """Check that the server observed all vehicles first; margin: time until a vehicle moved."""
     name, mission = "the server observes all first", scenario.make_reference()
     assert isinstance(mission, Mission)
     server = record.server

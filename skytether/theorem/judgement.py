@@ -36,7 +36,7 @@ class Judgement:
 
 
 def judged(record: Record, scenario: Scenario, reasons: Sequence[Reason] = ()) -> Judgement:
-    """Judgement of a mission's flight; without waits if flown over UDP. `reasons`: see `waits`."""
+    """Judgement of a mission's flight; over UDP it has no waits. `reasons`: see `waits`."""
     return Judgement(hypotheses(record, scenario), waits(record, scenario, reasons))
 
 

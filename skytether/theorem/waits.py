@@ -34,7 +34,7 @@ OTHER = re.compile(r"vehicle (\d+)( to pass)?|a zone")
 """Regular expression for the server's text about a vehicle that waits for a free way."""
 
 Reason: TypeAlias = tuple[float, int, str]
-"""Time of flight [s], vehicle, and what it waits for, as the server's text."""
+"""Time of flight [s], vehicle, and the server's text about what the vehicle waits for."""
 Question: TypeAlias = tuple[float, Callable[[World], None]]
 """Action in a flight: time [s], and the function called then; see `flight.fly`."""
 Kind = Literal["to begin", "acknowledgement", "way"]
@@ -50,13 +50,13 @@ class Wait:
     """Time of flight at which the wait begins [s]."""
     for_s: float
     other: int = 0
-    """Number of the vehicle waited for; 0 for a wait without another vehicle, as for a zone."""
+    """Number of the vehicle that is waited for; 0 if it is none, as in a wait for a zone."""
     motion_s: float = math.nan
-    """Time of sending of the unacknowledged motion, of `vehicle` or of `other` [s]."""
+    """Time at which the server sent the unacknowledged motion of `vehicle` or of `other` [s]."""
     plans: tuple[int, int] = (0, 0)
-    """Number of packets with that motion, and number lost."""
+    """Number of packets with this motion, and number of these that were lost."""
     reports: tuple[int, int] = (0, 0)
-    """Number of packets from the vehicle since it flew that motion, and number lost."""
+    """Number of packets from the vehicle since it flew this motion, and number of those lost."""
 
     @property
     def end_s(self) -> float:
@@ -77,7 +77,8 @@ class _Vehicle:
     sent_at: Indices
     """Number of the tick at which each motion was sent first."""
     heard_at: Indices
-    """Number of the tick at which the server knew whether each motion was accepted, or the last."""
+    """Number of the tick at which the server knew whether a motion was accepted, or the last
+    one."""
     is_heard: Flags
     """Whether the server knew at the tick in `heard_at` if the motion was accepted."""
     accepted: Indices
@@ -90,7 +91,7 @@ class _Vehicle:
 
 
 def questions(scenario: Scenario, reasons: list[Reason]) -> Iterator[Question]:
-    """Actions that append the server's texts about vehicles that wait, once for each decision."""
+    """Actions that append the server's texts about waiting vehicles, once for each decision."""
 
     def ask(world: World) -> None:
         for vehicle, figures in world.endpoint(flight.SERVER[0]).figures()["by_vehicle"].items():
@@ -142,7 +143,7 @@ def _sent_at(rows: Rows, sent: Indices) -> Indices:
 
 
 def _to_begin(vehicles: Sequence[_Vehicle]) -> Iterator[Wait]:
-    """Waits to begin: each vehicle waits for the last vehicle to begin."""
+    """Waits to begin: each vehicle waits for the vehicle that begins last."""
     last = max(vehicles, key=lambda each: each.begins_s, default=None)
     for each in vehicles:
         if last is not None and each.begins_s < last.begins_s:
@@ -175,7 +176,7 @@ def _acknowledgements(
 
 
 def _ways(reasons: Sequence[Reason], others: Sequence[Wait], every_s: float) -> Iterator[Wait]:
-    """Waits for a way; if the other vehicle waited for lost packets, with these packets."""
+    """Waits for a way, with the lost packets for which the other vehicle waited, if any."""
     last: dict[int, tuple[str, Wait]] = {}
     found = []
     for time_s, vehicle, text in reasons:

@@ -13,7 +13,7 @@ class Argument:
     """Annotation of a field: how its option is written on the command line."""
 
     name: str | None = None
-    """Name of the flag; None for the field's name; "" for one flag per field of the value."""
+    """Name of the flag. None: the field's name. "": each field of the value has its own flag."""
     metavar: str | None = None
     help: str | None = None
     """Help text of the option; None for the field's docstring."""

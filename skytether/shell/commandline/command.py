@@ -96,7 +96,7 @@ def parse(
     leads: bool = True,
     is_final: bool = True,
 ) -> O:
-    """Parse a command line; returns its options, with the named scenario as changed by flags.
+    """Parse a command line; returns its options, with the named scenario changed by its flags.
 
     The scenario is checked once, with its final values, because a flag may resolve a contradiction
     in the file.
@@ -172,7 +172,7 @@ def check_count(flag: str, given: int, most: int) -> None:
 
 
 def check_sealed(bind: Address, *, secure: bool) -> None:
-    """Refuse to run without keys at an address that other machines can reach."""
+    """Refuse a run without keys at an address that other machines can reach."""
     with suppress(OSError):  # an unusable address is reported when the socket is bound
         if not (secure or is_loopback(look_up(bind))):
             raise unsealed(bind)
@@ -236,7 +236,7 @@ def refuse_errors(plugin_errors: Mapping[str, int] | None) -> None:
 
 @contextmanager
 def interruptible() -> Iterator[Callable[[], bool]]:
-    """Catch Ctrl-C and SIGTERM in the block; yields a function that tells whether one has come."""
+    """Catch Ctrl-C and SIGTERM in the block; yields a function that returns whether one came."""
     interrupted = threading.Event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = [signal.signal(number, lambda *_: interrupted.set()) for number in numbers]

@@ -26,7 +26,7 @@ GROUPS = {
     ),
     "processes and plug-ins": ("workers", "scheduler", "plugin"),
 }
-"""Flags by group, the same for all commands; other flags are a command's own options."""
+"""Flags of each group of the help. A flag that is not listed belongs to the group of options."""
 MARGIN, INDENT_MAX = "  ", 26
 SHORT = {bool: "", int: "N", float: "NUMBER", str: "TEXT"}
 
@@ -151,7 +151,7 @@ def _grouped(groups: Mapping[str, Sequence[OptionText]]) -> str:
 
 
 def _paragraphs(text: str) -> list[str]:
-    """Paragraphs of a docstring, wrapped to the terminal's width; indented ones are unchanged."""
+    """Paragraphs of a docstring, wrapped to the terminal's width; indented lines are unchanged."""
     parts = cleandoc(text).split("\n\n")
     return [part if part.startswith(" ") else _filled(part) for part in parts if part]
 

@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
-    """Options of a command line, and the others from `default`; `help_` describes the command.
+    """Options of a command line, completed from `default`; `help_` is the help's first text.
 
     Raises:
         ConfigError: a flag is wrong, or a plug-in cannot be imported.
@@ -61,7 +61,7 @@ def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
 
 
 def refusal(frame: str, options: type, prog: str) -> str:
-    """Error message about a wrong command line, made from the frame of text that tyro prints."""
+    """Error message about a wrong command line, extracted from the framed text that tyro prints."""
     lines = (line.strip("│ ") for line in frame.splitlines() if line.startswith("│"))
     said = " ".join(takewhile(lambda line: not line.startswith("─"), lines))
     if unknown := re.match(r"Unrecognized options: (.*?)(?:, |$)", said):
@@ -97,10 +97,10 @@ REFUSALS = (
 
 
 def key_values(argv: Sequence[str], options: type) -> tuple[list[str], dict[str, Any]]:
-    """Command line without flags of a scenario's keys, and the values of those keys.
+    """Command line without the flags of a scenario's keys, and the values of these keys.
 
-    The flag of a key is followed by one word; if its value is a list, by all words up to the next
-    flag; if it is a boolean, by none: `--control.feedback`, `--control.no-feedback`.
+    A key's flag is followed by one word. The flag of a list is followed by all words up to the next
+    flag, the flag of a boolean by none: `--control.feedback`, `--control.no-feedback`.
 
     Args:
         argv: the command line.
@@ -179,7 +179,7 @@ def toml_value(text: str) -> Any:
 
 
 def plain(default: T, argv: Sequence[str]) -> T | None:
-    """Options of a command line, parsed like tyro if it has simple flags only; None otherwise.
+    """Options of a command line that has only simple flags, as tyro parses them; otherwise None.
 
     Simple flags are `--flag VALUE`, `--flag=VALUE` and the bare `--flag` of a boolean, after at
     most one positional value. A value is a text, a path, a number or a literal, without a leading
@@ -230,7 +230,7 @@ def _flags(options: type) -> tuple[Mapping[str, str], Sequence[str]]:
 
 
 def _value(hint: Any, text: str, *, given: bool) -> Any:
-    """Convert a text to the type `hint`; `given`: written as `--flag=VALUE`.
+    """Convert a text to the type `hint`; `given` if the text was written as `--flag=VALUE`.
 
     Raises:
         ValueError: only tyro can parse the value.
@@ -247,7 +247,7 @@ def _value(hint: Any, text: str, *, given: bool) -> Any:
 
 
 def _tell_tyro(options: type, undo: ExitStack) -> None:
-    """Replace the annotations of options by annotations for tyro; a scenario's keys get none.
+    """Replace the annotations of options by annotations for tyro, which skips the scenario's keys.
 
     Args:
         undo: restores the options' own annotations.

@@ -44,7 +44,7 @@ GROUPS = {
 
 class Plugin(NamedTuple):
     path: str
-    """Absolute path, which is also the name of its module."""
+    """Absolute path of the file, which is also the name of the module."""
     code: bytes
 
 
@@ -52,12 +52,12 @@ _loaded: dict[str, Plugin] = {}
 
 
 def named(argv: Sequence[str]) -> list[str]:
-    """Plug-in files named on a command line; needed before other arguments can be parsed."""
+    """Plug-in files named on a command line. They are imported before other flags are parsed."""
     return flag_values(argv, FLAG)[0]
 
 
 def flag_values(argv: Sequence[str], flag: str) -> tuple[list[str], list[str]]:
-    """Split a command line: values of a flag, and other words (a flag without value is a word)."""
+    """Values of a flag on a command line, and all other words; the flag without value is a word."""
     words, values, rest = deque(argv), list[str](), list[str]()
     while words:
         word = words.popleft()

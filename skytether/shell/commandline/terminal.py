@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 class Bar(Protocol):
     def __call__(self, done: float, text: str = "") -> None:
-        """Show the progress, in the bar's unit, and a remark beside the bar."""
+        """Show the progress `done`, in the unit of the bar, and a remark beside the bar."""
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 Each connected client gets its own connection to the server. Pieces of data from both go to the
 endpoint as datagrams with the peers `(CLIENT, number)` and `(SERVER, number)`; an empty piece means
 that the peer has sent its last data. While HELD_MAX pieces of a peer are under way, its socket is
-not read, so that TCP slows it down. If one peer resets its connection, the other's is reset, too.
+not read, so that TCP slows the peer. If a peer resets its connection, the other is reset, too.
 """
 
 import asyncio
@@ -68,7 +68,7 @@ class SocketHalf:
 
 
 class Connections:
-    """Listens for clients, and connects each to the server.
+    """Relay that listens for clients, and opens a connection to the server for each client.
 
     Args:
         hear: called with each piece of data.
@@ -84,7 +84,7 @@ class Connections:
         self._server, self._most, self._refused = listen.server, listen.most, refused
         self._hear: Hear = lambda piece, peer: hear(Datagram(piece, peer, 1))
         self._ways: dict[Address, SocketHalf] = {}
-        """Each direction of each connection, by the peer that it leads to."""
+        """Directions of all connections, by the peer at the receiving end."""
         self._running: set[asyncio.Task[None]] = set()
         self._opened = 0
         self._socket = listen_tcp(listen.bind)

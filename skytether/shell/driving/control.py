@@ -1,6 +1,6 @@
 """Control socket: a Unix socket, usable only by its owner, through which keys change in flight.
 
-A datagram is a request (`shared.endpoints.change`); the answer goes back to the sender. The socket
+Each datagram is a request (`shared.endpoints.change`); its answer is sent to its sender. The socket
 pauses after each request, so that a flood of requests delays the sender, not the endpoint. An
 answer that cannot be delivered is dropped.
 """
@@ -25,7 +25,7 @@ from skytether.shell.host import system
 from skytether.shell.host.local import Local
 
 NETEMS = ("netem", *(f"netem {number}" for number in range(2, PATHS_MAX + 2)))
-"""Names of the netem processes: one for each path of a session, and one to a standby server."""
+"""Names of the netem processes: one for each path of a session, and one for the standby server."""
 PROCESSES = ("server", "server 2", *NETEMS, "client")
 """Names of the processes, and of their sockets in a flight's folder."""
 
@@ -62,7 +62,7 @@ class Control:
         self._after: Callable[[], None] = lambda: None
 
     def begin(self, loop: asyncio.AbstractEventLoop, after: Callable[[], None]) -> None:
-        """Answer requests from now on; `after` is called after each request."""
+        """Answer requests in this event loop; `after` is called after each request."""
         self._loop, self._after = loop, after
         self._listen()
 
@@ -125,7 +125,7 @@ class Control:
             self._loop = None
 
     def close(self) -> None:
-        """Remove the socket, if the path still leads to it."""
+        """Remove the socket, unless another process has replaced it."""
         self._local.close()
 
 
@@ -188,10 +188,10 @@ class Caller:
 
 
 def _answers(sock: socket.socket, path: Path) -> "tempfile.TemporaryDirectory[str]":
-    """Bind a socket to a new address, at which answers arrive; returns the folder of the address.
+    """Bind a socket to a new path, at which answers arrive; returns the new folder of this path.
 
-    The address is beside the control socket, because a process in another container may have no
-    access to other folders. If it cannot be created there, a temporary folder is used.
+    The folder is beside the control socket, because a process in another container may have no
+    access to other folders. If it cannot be created there, it is created as a temporary folder.
 
     Raises:
         OSError: the address cannot be created anywhere.

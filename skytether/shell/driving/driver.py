@@ -61,9 +61,9 @@ BURST_MAX = BATCH_MAX
 """Largest number of datagrams read from one socket before timers and other sockets have their
 turn."""
 TOGETHER_MIN = 4
-"""Smallest number of datagrams for a batch call: single calls are faster for fewer datagrams."""
+"""Smallest number of datagrams for a batch call; for fewer datagrams, single calls are faster."""
 CROWD_MIN = 2 * TOGETHER_MIN
-"""Number of datagrams within `Endpoint.patience_ns` from which a socket is read in batches."""
+"""A socket is read in batches if this many datagrams arrive within `Endpoint.patience_ns`."""
 BATCHES_MAX = 4
 """Largest number of batches read from one socket before timers and other sockets have their
 turn."""
@@ -76,7 +76,7 @@ RESOLVE_EVERY_S = 2.0
 """Interval at which host names are resolved again [s]: a restarted host may have a new address."""
 CHECK_PATHS_EVERY_S = 1.0
 Numbers = dict[Address, Address]
-"""Numeric address of each peer, by its address as the user gave it."""
+"""Numeric address of each peer, by the peer's address as the user gave it."""
 
 
 class OpenLine(Protocol):
@@ -122,14 +122,14 @@ class Shell:
             sockets 0, 1 and so on. Further sockets are opened when the endpoint sends from them.
         peers: addresses that the endpoint will send to, with host names or numbers. The endpoint
             sees the addresses as written here, not as the kernel returns them.
-        stopwatch: measures receiving and sending.
+        stopwatch: measures the time spent on receiving and on sending.
         forms: forms that datagrams at the bound sockets must have; empty to accept all datagrams.
         control: control socket for changes of keys in flight.
         feed: socket that sends rows and events to readers.
-        line: connection to an autopilot, a robot, a program's packets or relayed clients, which
-            becomes socket 1; or a function `open_line(hear, refused)` that opens one.
-        paths: paths to the endpoint's peers, by socket number. If there are several, a path that is
-            unusable now is opened later.
+        line: connection to an autopilot, a robot, a program's packets or relayed clients, or a
+            function `open_line(hear, refused)` that opens it. It becomes socket 1.
+        paths: paths to the endpoint's peers, by socket number. Of several paths, those that cannot
+            be opened at once are opened later.
         is_patient: whether to start if the name of a path's peer cannot be resolved yet; the lookup
             is then repeated.
         memory: file for the state that the endpoint keeps for the next run of its process.
@@ -334,7 +334,7 @@ class Shell:
             self._after()
 
     def _count(self, number: int, count: int) -> None:
-        """Count datagrams at a socket, and switch to batches if they are many."""
+        """Count datagrams at a socket, and decide whether the socket is read in batches."""
         now_ns = time.monotonic_ns()
         arrivals = self._arrivals.setdefault(number, Arrivals(now_ns))
         if now_ns - arrivals.since_ns >= self._patience_ns:
@@ -367,8 +367,8 @@ class Shell:
         """Read the datagrams at each socket that is read in batches, in at most BATCHES_MAX calls
         per socket.
 
-        Waking the process for each datagram, with cold caches, would take twice the time. The
-        kernel's timestamps give the arrival times.
+        Waking the process for each datagram would take twice the time, because its caches are cold.
+        The arrival times are the kernel's timestamps.
         """
         is_left, nothing_came = False, list[int]()
         came: list[tuple[int, Datagram]] = []
@@ -552,8 +552,7 @@ class Shell:
         while any(names.may_change for names in all_names):
             await asyncio.sleep(RESOLVE_EVERY_S)
             addresses: asyncio.Future[list[Numbers]] = self._loop.create_future()
-            # A thread, because the event loop would wait at its end for a lookup in an executor, up
-            # to 20 s.
+            # Not in an executor, for whose lookup the event loop would wait up to 20 s at its end.
             work = all_names, addresses
             threading.Thread(target=self._look_up, args=work, daemon=True).start()
             self._learn(all_names, await addresses)
@@ -573,7 +572,7 @@ class Shell:
                 self._open_again(number)
 
     def _open_again(self, number: int) -> None:
-        """Open a new socket for a path, in place of the old one."""
+        """Open a new socket for a path, instead of the path's old socket."""
         with contextlib.suppress(OSError):  # the path is down again
             before = self._sockets.get(number)
             self._put(number, self._paths[number].open())
@@ -618,14 +617,14 @@ def run(
 ) -> None:
     """Drive several endpoints in this process until all have finished.
 
-    At SIGINT or SIGTERM they are asked to end, see `Endpoint.leave`; a second signal ends them.
+    SIGINT or SIGTERM asks the endpoints to end (`Endpoint.leave`); a second signal ends them.
 
     Args:
         on_start: called once signals are handled, before the endpoints run.
         on_event: called with each event of an endpoint, and with each exception of its code.
         on_usr1: called at SIGUSR1.
         on_second: called about once a second.
-        on_signal: called with a signal's number, in place of own handling, to pass it on.
+        on_signal: called with the number of a signal that is to be passed on to a program.
     """
     # Without `freeze`, garbage collection would scan all imported objects, which takes 13 ms.
     gc.collect()

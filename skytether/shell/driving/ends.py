@@ -1,6 +1,5 @@
-"""Recorder of the packets at an endpoint (`shared.telemetry.ends`): an endpoint that wraps it.
-
-Only processes with a feed use the recorder.
+"""Recorder of an endpoint's packets (`shared.telemetry.ends`), which is wrapped around the
+endpoint. Only processes with a feed use the recorder.
 """
 
 import time
@@ -16,7 +15,7 @@ from skytether.shared.wire.framing import split
 from skytether.shared.wire.protocol import kind_of
 
 PEERS_MAX = 1024
-"""Largest number of addresses with their own number in the record; all others share a number."""
+"""Largest number of peers with their own number in the record; further peers share a number."""
 
 
 class Watched(Steady):

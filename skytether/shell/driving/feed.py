@@ -39,7 +39,7 @@ WAITING_BYTES_MAX = 4 * 1024 * 1024
 BACKLOG_BYTES_MAX = 1024 * 1024
 """Largest number of bytes of sent frames that are kept for readers that connect later."""
 ROWS_BYTES_MAX = 256 * 1024
-"""Size of the rows in a frame from which the next rows go into a new frame [B]."""
+"""A frame ends once its rows have this size [B]; the next rows go into a new frame."""
 SEND_BYTES_MAX = 64 * 1024
 """Largest number of bytes sent to a reader in one turn of the loop."""
 GATHER_S = 0.01
@@ -57,7 +57,7 @@ FOLLOWED_MAX = 128
 
 
 class _Part:
-    """Rows of one part of the record, as they wait to be put into a frame."""
+    """Rows of one part of the record that wait to be put into a frame."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -114,7 +114,7 @@ class Feed:
         self._backlog_bytes = 0
         self._readers: list[_Reader] = []
         self._behind: set[_Reader] = set()
-        """Readers whose sockets are full; the loop calls back when they can send again."""
+        """Readers whose sockets are full; the loop calls back when a socket can send again."""
         self._loop: AbstractEventLoop | None = None
         self._armed: TimerHandle | None = None
         self._opened: Callable[[], Opened] | None = None
@@ -131,7 +131,7 @@ class Feed:
         return described(self._columns)
 
     def open(self, opened: Callable[[], Opened]) -> None:
-        """Accept readers once the event loop runs; `opened` makes each reader's first frame."""
+        """Accept readers once the event loop runs; `opened` makes the first frame of a reader."""
         self._opened = opened
 
     def begin(self, loop: AbstractEventLoop) -> None:
@@ -306,7 +306,7 @@ class Subscriber:
                 found = self._further()
 
     async def _follow(self, name: str, path: Path) -> None:
-        """Read the feed of a process, and of each process that listens at the same path later."""
+        """Read the feed of a process, and of each process that later listens at the same path."""
         while not self._closed:
             with suppress(OSError):  # no process listens, or its connection queue is full
                 stream, connection = await asyncio.open_unix_connection(path, limit=READ_BYTES)

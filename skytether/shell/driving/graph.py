@@ -1,8 +1,8 @@
 """Node of the ROS graph on a Zenoh network, beside the sockets of a `Shell`.
 
-Zenoh has its own sockets and threads. Its threads only put received messages into a queue; the
-event loop passes them to the endpoint as datagrams with the topic's name as the peer's host. Zenoh
-itself reconnects to a lost router.
+Zenoh has its own sockets and threads. Its threads only put received messages into a queue. The
+event loop passes the messages to the endpoint as datagrams; the peer's host is the topic's name.
+If the router is lost, Zenoh itself connects again.
 """
 
 import asyncio
@@ -92,9 +92,9 @@ class GraphSession:
         ]
 
     def _publish(self, form: int) -> None:
-        """Publish the topic with one of its types, in place of the earlier type."""
+        """Publish the topic with one of its message types, instead of the present type."""
         node, session = self._node, self._session
-        # Commands without a connection are dropped, because they would be stale later.
+        # Commands are dropped while there is no connection, because they would be stale later.
         self._publisher = session.declare_publisher(
             node.forms[form].key(node.domain),
             congestion_control=self._zenoh.CongestionControl.DROP,

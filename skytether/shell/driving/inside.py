@@ -1,12 +1,12 @@
 """Process inside the namespaces of a program: `python -m skytether.shell.driving.inside FD MTU CMD
 ARG…`.
 
-It makes namespaces of network, mounts and processes, and in them a first process with number 1.
+The process makes namespaces of network, mounts and processes, and in them a process with number 1.
 Process 1 opens the only network device, sends it to netem through the socket FD, and runs the
 program. When process 1 ends, the kernel ends all processes of the namespaces, network and device.
-Process 1 ends when the socket closes, also because netem was killed.
+Process 1 ends when the socket closes, for example because netem was killed.
 
-It imports few modules of the package, because it is started with each program.
+This module imports few modules of the package, because it is started with each program.
 """
 
 import ctypes
@@ -29,10 +29,10 @@ from skytether.shell.host import system
 
 READY, START, ENDED, ALL_ENDED = b"ready", b"start", b"ended", b"all ended"
 """Messages: ready, with the device; start the program; the program has ended, with its wait status;
-all its processes have ended. Other messages are errors (to netem) or signal numbers (from netem).
+all its processes have ended. Other messages to netem are errors, others from netem signal numbers.
 """
 LINGER_S = 10.0
-"""Longest time for connections closed by the program to send their remaining data [s]."""
+"""Longest wait after the program's end until its TCP connections have sent their data [s]."""
 LOOK_EVERY_S = 0.02
 CLOSING = ("04", "09", "0B")
 """States in /proc/net/tcp of a connection with data or a FIN under way: FIN_WAIT1, LAST_ACK,
@@ -42,9 +42,9 @@ QUEUE = 10_000
 RESOLVERS = ("/run/nscd", "/run/systemd/resolve")
 """Folders of sockets through which this machine resolves names for programs."""
 FORBIDDEN = (EACCES, EPERM, ENOSPC)
-"""Errors if the system or a container does not allow namespaces; ENOSPC: there are too many."""
+"""Errors if the system or a container allows no namespaces, or no more of them (ENOSPC)."""
 ADMIN = ":/usr/local/sbin:/usr/sbin:/sbin"
-"""Folders that are missing in the PATH of ordinary users."""
+"""Folders of administration programs, which are not in the PATH of ordinary users."""
 
 _NEWNS, _NEWUSER, _NEWPID, _NEWNET = 0x00020000, 0x10000000, 0x20000000, 0x40000000
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000

@@ -27,7 +27,7 @@ from skytether.shell.commandline.command import CONFIGURATION, CommandError
 SUFFIX = ".set"
 BYTES_MAX = 1_000_000
 DAY_S = 86_400.0
-"""Age above which a journal is refused, as one of an earlier flight [s]."""
+"""Age above which a journal is refused, because it is of an earlier flight [s]."""
 
 
 class _Entry(msgspec.Struct, frozen=True, kw_only=True):

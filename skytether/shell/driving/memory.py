@@ -4,9 +4,9 @@
 
 A thread writes a new file and renames it, so that no step waits for a disk and the file is always
 complete. If a write fails while the endpoint waits for it, the file is removed, so that the next
-run uses no old state, and the endpoint goes on. A file that cannot be removed either, on a
-read-only disk, is refused by the next run, as are a damaged file and a file of another vehicle, key
-or flight. The file need not survive a reboot, because a reboot takes longer than any motion.
+run uses no old state, and the endpoint goes on. If the file cannot be removed (read-only disk), the
+next run refuses it, and so it refuses a damaged file and a file of another vehicle, key or flight.
+The file need not survive a reboot, because a reboot takes longer than any motion.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ FILE_BYTES_MAX = 65_536
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
 DISK_FAILED = {EROFS, EIO}
-"""Errors of a failed disk. A full disk is not a failed disk: the empty lock file still fits."""
+"""Errors of a failed disk. A full disk is not one, because the empty lock file still fits."""
 AGAIN_S = 1.0
 """Time after which a failed write is repeated [s]."""
 
@@ -47,7 +47,7 @@ class _Envelope(msgspec.Struct, frozen=True, array_like=True):
     written_ns: int
     """Time of writing [ns; monotonic clock of the host]."""
     identity: dict[str, str]
-    """Identity of the writer by name: vehicle, flight; the reader must have the same."""
+    """Facts that identify the writer, by name: vehicle, flight. The reader's must be equal."""
     content: bytes
 
 
@@ -55,8 +55,8 @@ def folder(given: str) -> Path:
     """Folder for the memory file.
 
     Args:
-        given: key `vehicle.memory`: a path, or "auto" for the state folder of the systemd service,
-            or of the user without a service.
+        given: key `vehicle.memory`: a path, or "auto" for the state folder of the systemd service
+            or, without a service, of the user.
     """
     if given != "auto":
         return Path(given).expanduser()
@@ -72,7 +72,7 @@ class MemoryFile:
 
     Args:
         path: path of the file; a missing folder is created.
-        identity: names and values that the file must contain: vehicle, flight.
+        identity: facts that the file must contain, by name: the vehicle and the flight.
         secret: key of the vehicle, which authenticates the file; empty without keys.
 
     Raises:
@@ -94,11 +94,11 @@ class MemoryFile:
         self._ends = False
         self._thread: threading.Thread | None = None
         self._failure = self._reported = ""
-        """Why the newest content is not written, and the reason last reported; "" for none."""
+        """Reason why the last write failed, and last reported reason; "" for no reason."""
         self._is_removed = False
         """Whether the file was removed, because it could not be written."""
         self._kept_nothing = False
-        """Whether the newest information of the endpoint is that no state is saved."""
+        """Whether the endpoint was last informed that no state is saved."""
 
     @property
     def path(self) -> Path:
@@ -157,7 +157,7 @@ class MemoryFile:
     # -- in flight -----------------------------------------------------------------------------
 
     def begin(self, endpoint: Endpoint, loop: asyncio.AbstractEventLoop) -> None:
-        """Start the thread that writes the endpoint's state and confirms writes to the endpoint."""
+        """Start the thread that writes the endpoint's state and confirms this to the endpoint."""
         self._endpoint, self._loop = endpoint, loop
         self._thread = threading.Thread(target=self._work, daemon=True)
         self._thread.start()
@@ -171,7 +171,7 @@ class MemoryFile:
                 self._changed.notify()
 
     def news(self) -> NotKept | None:
-        """Event with the reason why the file cannot be written; None without a new reason."""
+        """Event with the reason why the file cannot be written; None if there is no new reason."""
         failure, reported = self._failure, self._reported
         self._reported = failure
         if not failure or failure == reported:

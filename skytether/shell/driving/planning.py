@@ -1,9 +1,9 @@
 """Planners of plug-ins in real time: each call in a thread, with a time limit.
 
 If a planner takes too long, the tick continues without its plan. The planner is not called again
-before its call ends, and the late plan is dropped. So a planner that hangs delays other vehicles'
-plans once, by the limit, and no tick is missed. As threads cannot be ended, no further call is
-started once HANGING_MAX calls hang, including calls for vehicles that have left.
+before its call ends, and the late plan is dropped. So a planner that hangs delays the other
+vehicles' plans once, by the limit, and no tick is missed. Threads cannot be ended: once HANGING_MAX
+calls hang, no further call is started. Hanging calls for vehicles that have left count, too.
 """
 
 import time
@@ -15,7 +15,7 @@ from typing import Any
 SHARE = 0.5
 """Share of a step for which a tick waits for planners, so that the next tick is in time."""
 HANGING_MAX = 64
-"""Number of unfinished calls of earlier ticks from which no new call is started."""
+"""If this many calls of earlier ticks are unfinished, no new call is started."""
 
 Call = Callable[[], Any]
 Calls = SimpleQueue[tuple[int, int, Call]]
@@ -32,7 +32,7 @@ class Planners:
         self._busy: dict[int, Calls] = {}
         """Queue of calls of each busy thread, by number of the planner that it runs."""
         self._answers: SimpleQueue[tuple[int, int, Any]] = SimpleQueue()
-        """Answers of threads: number of planner, number of tick, and its result or exception."""
+        """Answers of threads: numbers of the planner and the tick, and the result or exception."""
         self._tick = 0
 
     def __call__(self, calls: Sequence[tuple[int, Call]]) -> list[Any]:
@@ -81,6 +81,6 @@ class Planners:
                 answer = call()
             except Exception as error:
                 answer = error
-            except BaseException as error:  # keep the thread: once ended, it would count as hanging
+            except BaseException as error:  # an ended thread would count as hanging
                 answer = RuntimeError(f"got {type(error).__name__}: {error}")
             self._answers.put((planner, tick, answer))

@@ -2,9 +2,9 @@
 
     program ── TUN device ── netem ── slirp4netns ── this machine's sockets
 
-slirp4netns translates packets to sockets of this machine, as for a virtual machine. slirp4netns
-gets Ethernet frames through a Unix socket, in its mode for User Mode Linux, and so needs no
-namespace. See `shell.driving.inside` for the program.
+slirp4netns translates packets to sockets of this machine, as for a virtual machine. It gets
+Ethernet frames through a Unix socket, as from User Mode Linux, and so needs no namespace.
+`shell.driving.inside` has the program's side.
 """
 
 import asyncio
@@ -46,9 +46,10 @@ exec 9<&0 </dev/null
 (read -r _ <&9; kill -9 0) &
 exec "$@" 9<&-
 """
-"""Shell script that becomes slirp4netns, with a limit of one file per flow, and starts a guard that
-kills it when netem ends. Only netem and the guard have the two ends of the script's standard input,
-so each sees when the other has ended. `--exit-fd` would have no effect before netem connects."""
+"""Shell script that raises the limit of open files (slirp4netns needs one per flow), starts a guard
+that kills slirp4netns when netem ends, and becomes slirp4netns. Only netem and the guard have the
+ends of its standard input, so each sees the other end. `--exit-fd` has no effect before netem
+connects."""
 FRAME_BYTES_MAX = 65_536
 WAITING_MAX = 16_384
 """Largest number of packets waiting for slirp4netns; further packets count as send errors."""
@@ -61,7 +62,7 @@ FLUSH_S = 1.0
 
 
 class ProgramError(Exception):
-    """The program cannot be started, or has lost its network; the message is one line."""
+    """The program cannot be started, or has lost its network; the message has one line."""
 
 
 @dataclass(slots=True)
@@ -69,9 +70,9 @@ class Program:
     device: int
     """File descriptor of the program's TUN device."""
     outside: socket.socket
-    """Connection to slirp4netns, with one frame per packet."""
+    """Connection to slirp4netns, with one Ethernet frame in each packet."""
     guard: socket.socket
-    """Connection to the guard of slirp4netns, see `GUARDED`: readable once it has ended."""
+    """Connection to the guard of slirp4netns (`GUARDED`): readable once the guard has ended."""
     control: socket.socket
     """Connection to process 1 of the program's namespaces."""
     status: int | None = None
@@ -79,13 +80,13 @@ class Program:
     fault: str = ""
     """Reason why the program has lost its network; empty otherwise."""
     outlives_parent: bool = False
-    """Whether the program goes on after the end of netem's parent process, as under `nohup`."""
+    """Whether the program continues after netem's parent process has ended, as under `nohup`."""
 
     def start(self) -> None:
         self.control.send(START)
 
     def signal(self, number: int) -> None:
-        """Pass a signal on to the program; after its end, end the processes that it has left."""
+        """Send a signal to the program; after the program's end, it ends the remaining children."""
         with suppress(OSError):
             self.control.send(bytes([number]))
         if number == signal.SIGTSTP:  # the shell waits until netem has stopped, too
@@ -166,7 +167,7 @@ def _slirp(mtu: int, exposed: Sequence[Address]) -> Iterator[tuple[socket.socket
                     sock.shutdown(socket.SHUT_WR)
                     return "return" in json.loads(sock.recv(4096) or b"{}")
 
-            order("list_hostfwd")  # slirp4netns needs the folder until it can answer
+            order("list_hostfwd")  # slirp4netns needs the folder until it answers
             for address in exposed:
                 _expose(order, address)
         for each in announcements():
@@ -216,7 +217,7 @@ def _expose(order: Callable[..., bool], address: Address) -> None:
 
 
 def _why_not(kind: socket.SocketKind, address: Address) -> str:
-    """Reason why listening on an address fails, which slirp4netns does not report."""
+    """Reason why listening on an address fails; slirp4netns does not report the reason."""
     try:
         with socket.socket(socket.AF_INET, kind) as sock:
             sock.bind(address)
@@ -294,7 +295,7 @@ class ProgramLine:
                 os.close(parent)
 
     def _read_device(self) -> int:
-        """Read packets of the program and pass them on; returns how many."""
+        """Read packets of the program and pass them on; returns the number of packets."""
         buffer, packets = self._buffer, list[Datagram]()
         with suppress(OSError):
             while len(packets) < BATCH_MAX:

@@ -42,7 +42,7 @@ class RecordFile:
         self._is_reported = False
 
     def news(self) -> RecordIncomplete | None:
-        """Event that reports lost rows, once, after the first loss; otherwise None."""
+        """Event that reports lost rows, returned once after the first loss; otherwise None."""
         reason = self._reason()
         if reason is None or self._is_reported:
             return None
@@ -55,7 +55,7 @@ class RecordFile:
         self._ended = True
 
     def fault(self) -> str | None:
-        """Error message about rows missing in the file; None without any. Valid after `end`."""
+        """Message about rows missing in the file; None if no row is missing. Valid after `end`."""
         reason = self._reason()
         if reason is None:
             return None
@@ -74,7 +74,7 @@ class RecordFile:
         """Complete rows in the file; valid after `end`."""
         part = bytearray()
         while not isinstance(self._file, OSError) and len(part) < self._writer.written:
-            # Not `read`, which would move the file position of a late write.
+            # Not `read`, which would move the position at which the thread may still write.
             count = min(self._writer.written - len(part), TOGETHER_BYTES)
             piece = os.pread(self._file.fileno(), count, len(part))
             if not piece:

@@ -1,7 +1,7 @@
 """Byte streams, TCP and serial, driven by asyncio beside the sockets of a `Shell`.
 
-A stream that has ended or cannot be opened yet is opened again every second while its endpoint
-runs, for example after a cable was unplugged.
+A stream that has ended, for example because a cable was unplugged, or that cannot be opened yet, is
+opened again every second while its endpoint runs.
 """
 
 import asyncio

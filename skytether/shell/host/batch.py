@@ -3,10 +3,10 @@
 `recvmmsg` and `sendmmsg` take an array of message headers, which is allocated once. `recvmmsg` also
 returns the kernel's arrival time of each datagram, so that reading late does not count as network
 delay. UDP segmentation offload sends datagrams of one size to one peer as one long datagram, which
-the kernel splits late.
+the kernel splits just before sending.
 
 None of these calls says which datagram failed, or why. If a call sends or receives fewer than
-asked, the caller tries the next datagram by the socket's plain call, which raises its error.
+asked, the caller tries the next datagram by the socket's plain call, which raises the error.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ from skytether.shared.base.units import SECOND_NS
 
 BATCH_MAX = 128
 NEAR_NS, READINGS = 5_000, 4
-"""Longest time between two clock readings that count as simultaneous [ns]; number of attempts."""
+"""Longest time between clock readings that count as simultaneous [ns]; number of attempts."""
 SIZE_MAX = 2048
 """Largest payload that `DatagramBatch.send` takes [B]; packets of a flight have at most 1200."""
 SEGMENTS_MAX = 64
@@ -173,7 +173,7 @@ class DatagramBatch:
         Returns:
             payloads, senders, and arrival times [ns; CLOCK_MONOTONIC], in the order of arrival; all
             empty if there was no datagram, or an error. Arrival times are converted from the
-            kernel's time of day, so a step of that clock makes them wrong by its size. A datagram
+            kernel's time of day, so a step of this clock shifts them by the step. A datagram
             without an arrival time gets the present time.
         """
         rows, size = self._in, self._name_bytes
@@ -220,8 +220,8 @@ class Segments:
 
     def __init__(self) -> None:
         self.size_max = SEGMENT_BYTES_MAX if sys.platform == "linux" else 0
-        """Largest payload for which segmentation is tried [B]; lowered when the kernel refuses a
-        size, because it exceeds the path's MTU, and to 0 when the kernel has no segmentation.
+        """Largest payload for which segmentation is tried [B]; 0 except on Linux. It is lowered
+        below any size that the kernel refuses, for example because the size exceeds the path's MTU.
         """
 
     def suits(self, payloads: Sequence[bytes]) -> bool:
@@ -238,7 +238,7 @@ class Segments:
 
         Args:
             payloads: payloads for which `suits` is true.
-            peer: their receiver, as `socket.sendmsg` takes it.
+            peer: receiver of all payloads, as `socket.sendmsg` takes it.
         """
         first, count = 0, len(payloads)
         while first < count:

@@ -91,7 +91,7 @@ def compile_kernels(kernels: Sequence["Missing"], on_done: Callable[[], None]) -
     """Compile kernels, in parallel where there are several cores.
 
     Args:
-        kernels: kernels to compile; those that take longest should come first.
+        kernels: kernels to compile; kernels that take longest should come first.
         on_done: called after each kernel, from any thread.
     """
     queue = deque(each for each in kernels if each.is_stored)

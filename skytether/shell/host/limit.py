@@ -27,7 +27,7 @@ class Limit:
         self._seconds: dict[str, _Second] = {}
 
     def admit(self, event: Event, *, now_ns: int) -> Sequence[Event]:
-        """Events to log now: `Omitted` counts of past seconds, and this event if within the limit.
+        """Events to log now: `Omitted` counts of past seconds, and this event if still allowed.
 
         An `Omitted` event is not returned: its count is added to the omitted events of its kind.
         """

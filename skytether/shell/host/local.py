@@ -11,7 +11,7 @@ from skytether.shell.host import system
 
 
 class LocalError(OSError):
-    """A Unix socket cannot be created; the message says where and why."""
+    """A Unix socket cannot be created; the message has the path and the reason."""
 
 
 class Local:
@@ -51,7 +51,7 @@ class Local:
         self._made = status.st_dev, status.st_ino
 
     def close(self) -> None:
-        """Remove the socket, if the path still leads to it."""
+        """Remove the socket, unless another process has replaced it."""
         self.socket.close()
         with suppress(OSError):
             status = self._path.lstat()
@@ -60,7 +60,7 @@ class Local:
 
 
 def _clear(path: Path, kind: socket.SocketKind) -> None:
-    """Remove a socket of this user at which no process listens; leave anything else alone.
+    """Remove a socket of this user at which no process listens; refuse any other file.
 
     Raises:
         OSError: the path is in use.

@@ -2,7 +2,7 @@
 
 The socket of a path works again when its address, or its interface, is up again. After an interface
 was removed and added again, as by a modem that restarts, the socket is still bound to the old
-interface and must be opened again; only the interface's index shows this.
+interface and must be opened again; a changed index of the interface is the only sign of this.
 """
 
 import re

@@ -1,7 +1,7 @@
 """Features that not every operating system has; only this module checks for them.
 
 Flights in virtual time, the environments of `skytether.gym`, netem's relay and its pytest fixture
-run on every system with Python and numba. Other code checks here for what it needs.
+run on every system with Python and numba. Other modules ask this module which features exist.
 """
 
 import ctypes
@@ -60,7 +60,7 @@ def passable() -> tuple[int, ...]:
 
 
 def user() -> int:
-    """Number of the user as the owner of files; 0 on a system without user numbers."""
+    """Number of the user who owns this process's files; 0 on a system without user numbers."""
     return os.geteuid() if hasattr(os, "geteuid") else 0
 
 

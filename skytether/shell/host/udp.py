@@ -46,14 +46,14 @@ jump if at least, accept this number of bytes.
 
 
 class AddressError(OSError):
-    """An address given by the user cannot be used; the message says which and why."""
+    """An address given by the user cannot be used; the message has the address and the reason."""
 
 
 def within_reach_of(peers: Iterable[Address]) -> Address:
-    """Address to bind a socket to, with port 0: loopback if all peers are on loopback, else any.
+    """Address with port 0 to bind a socket to: loopback if all peers are on it, else the wildcard.
 
     Args:
-        peers: numeric addresses of one family; without any, IPv4 is assumed.
+        peers: numeric addresses of one family; if there are none, IPv4 is assumed.
     """
     peers = list(peers)
     six = any(":" in host for host, _ in peers)

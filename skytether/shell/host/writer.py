@@ -29,7 +29,8 @@ class Writer:
         self._capacity = capacity
         self._together = together
         self._pause_s = pause_s
-        # The caller's thread changes `offered` and `refused`; the writer's, the other counters.
+        # The caller's thread changes `offered` and `refused`, the writer's thread all other
+        # counters.
         self.offered = 0
         self.refused = 0
         """Number of bytes that were dropped because too many were waiting."""

@@ -3,10 +3,10 @@
     GET /metrics   figures, as text for Prometheus
     GET /healthz   200 while the process is healthy, else 503; JSON either way
 
-The event loop hands over its figures once a second; threads render them and answer requests, and
-never touch the endpoint. Connections are bounded in time and in number (the oldest is closed), so
-that no client blocks others; at most 50 are accepted per second. A request is refused if its Host
-header is a website's name, which may have been pointed at this machine (DNS rebinding).
+Once a second the event loop stores the endpoint's figures; threads answer requests from the stored
+figures, and never touch the endpoint. Connections are bounded in time and in number (the oldest is
+closed), so that no client blocks others; at most 50 are accepted per second. A request is refused
+if its Host header is a website's name, which may have been pointed at this machine (DNS rebinding).
 """
 
 import io

@@ -1,6 +1,6 @@
 """Metrics of a process for Prometheus: tables of names, units and labels, and its health.
 
-Each figure of an endpoint (`Endpoint.figures`) is in a table or in LEFT_OUT; other figures are
+Each figure of an endpoint (`Endpoint.figures`) is in a table or in LEFT_OUT. All others are
 counted, and fail a test. Names follow Prometheus: base units, `_total` for counters.
 """
 
@@ -24,7 +24,7 @@ class Metric(NamedTuple):
     """
     name: str
     labels: Mapping[str, str]
-    """Labels with fixed values, which distinguish the figures that this metric combines."""
+    """Labels with fixed values, which distinguish the figures that share the metric's name."""
     help: str
 
     @property
@@ -66,7 +66,7 @@ class Metric(NamedTuple):
 
 
 def table(text: str) -> tuple[Metric, ...]:
-    """Metrics of a table of two lines each: figure, name and labels; below them the help."""
+    """Metrics of a text with two lines for each: figure, name and labels; then the help."""
     lines = iter(text.strip().splitlines())
     metrics = []
     for head, description in zip(lines, lines, strict=True):
@@ -298,11 +298,11 @@ LEFT_OUT = {
 def families(
     process: str, figures: Mapping[str, Any], own: Sequence[Metric] = ()
 ) -> tuple[list[Exposed], list[str]]:
-    """Convert figures to metrics; also returns the paths of figures in no table.
+    """Convert figures to metrics; also returns the paths of figures without metric.
 
     Args:
         process: server, netem or client; other processes have only common metrics.
-        figures: from `Endpoint.figures`, and those that the process adds.
+        figures: figures from `Endpoint.figures`, and figures that the process adds.
         own: metrics of the figures, for a process that is not in TABLES.
     """
     possible = (*_PROCESS, *own) if own else TABLES.get(process, _PROCESS)

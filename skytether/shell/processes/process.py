@@ -274,7 +274,7 @@ def begin(
 
     Args:
         name, options, secure, warnings: see `Process`.
-        columns: columns of its rows.
+        columns: columns of the endpoint's rows.
         number: number of a worker, which is appended to its name; 0 for a single process.
         keeps_rows: whether rows go to a temporary file if no record is asked for.
 

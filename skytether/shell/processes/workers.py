@@ -26,7 +26,7 @@ PASSED_ON = (*ENDING, *system.signals("SIGUSR1"))
 
 
 def run(count: int, bind: Address, work: Callable[[int, socket], None]) -> int:
-    """Run `count` processes until the first of them ends; returns the worst exit code.
+    """Run `count` processes until the first of them ends; returns the largest exit code.
 
     Args:
         bind: address of all processes; port 0 takes a free one.

@@ -1,7 +1,7 @@
 """Explanations on the page of a recording, each computed by a process `skytether explain`.
 
-The process flies for up to a minute, with less priority than the page. After each step it writes
-its results so far to a file, which this module reads.
+The process computes for up to a minute, at a lower priority than the page. After each phase of the
+explanation it writes its results so far to a file, which this module reads.
 """
 
 import contextlib
@@ -30,7 +30,7 @@ POLL_S = 0.2
 BUTTONS_MAX = 12
 """Largest number of brake events with a button."""
 FIRST = "what went wrong"
-"""Text shown as the step in progress until the process has named its first step."""
+"""Name of the phase that is shown until the process has named its first phase."""
 GRAVEST = "What went wrong?"
 """Label of the button of a flight without brake events."""
 HINT = "Flies the same flight again, without its losses, until the cause is found"
@@ -42,7 +42,7 @@ class Findings:
 
     text: str = ""
     next: str = "another explanation"
-    """Step in progress, in words; empty if the explanation is complete."""
+    """Name of the phase in progress; empty if the explanation is complete."""
     refused: str = ""
     """Reason why there is no explanation; empty otherwise."""
 
@@ -104,7 +104,7 @@ class Explainer:
                 self.findings[at_s] = Findings(refused=lines[-1] if lines else "it has ended")
 
     def _read(self, at_s: float | None, found: Path) -> None:
-        # Before the first step the file is missing or empty.
+        # Before the end of the first phase the file is missing or empty.
         with contextlib.suppress(FileNotFoundError, msgspec.DecodeError):
             self.findings[at_s] = msgspec.json.decode(found.read_bytes(), type=Findings)
 

@@ -45,7 +45,7 @@ class PageFlight:
         self._opened_ns: dict[str, int] = {}
         """Start time of each process on its clock [ns]; a new start time means a new process."""
         self._before: dict[str, dict[str, Any]] = {}
-        """Values from before the link was cut, by netem; `heal` restores them."""
+        """Values of each netem from before its link was cut; `heal` restores them."""
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:
@@ -153,7 +153,7 @@ class PageFlight:
                 self.ask(netem, changed)
 
     def heal(self, netems: Collection[str] = NETEMS) -> None:
-        """Restore the loss from before a link was cut, or no loss if that is unknown."""
+        """Restore a cut link's earlier loss; if the earlier loss is unknown, set no loss."""
         for netem in self.cuts:
             if netem in netems:
                 self.ask(netem, self._before.get(netem) or controls.healed(self.values[netem]))

@@ -7,9 +7,9 @@ on the internet, values of any attribute. `Guard.served` makes it listen with th
 - a websocket is opened only for browsers that may watch (`access.refusal`), up to BROWSERS_MAX;
 - if there are too many connections, the one that was silent longest is closed;
 - only messages that our page sends (`MESSAGES`) are accepted, of at most 64 KiB in 64 pieces;
-- at most `RATE_HZ` messages a second are read; more of them wait in the browser's kernel;
-- a browser that does not read gets nothing more; it is disconnected after 40 s, because it answers
-  no pings, or at once if it sends pings itself.
+- at most `RATE_HZ` messages a second are read; further messages wait in the browser's kernel;
+- a browser that does not read is sent nothing more; after 40 s it is disconnected, because it
+  answers no pings, or at once if it sends pings itself.
 
 A misbehaving browser loses its own connection, and affects no other.
 """
@@ -190,7 +190,7 @@ class Guard:
                 self.browsers -= 1
 
     def arrive(self, newcomer: "_Connection") -> None:
-        """Count a connection. If there are too many, end the longest silent one or the new one."""
+        """Count a connection. If there are too many, end the longest silent or else the new one."""
         self.connections += 1
         self.idle[newcomer] = None
         if self.connections > CONNECTIONS_MAX and not self._make_room(newcomer):
@@ -242,7 +242,7 @@ class _Connection(sockets.ServerConnection):
             self.cut(TurnedAway.ROOM)
 
     def process_event(self, event: Any) -> None:
-        """End a connection that sends pings but does not read the answers: they would queue up."""
+        """End a connection that sends pings but does not read the answers, which would queue up."""
         if isinstance(event, Frame) and event.opcode is Opcode.PING and self.paused:
             self.cut(TurnedAway.ROOM)
         super().process_event(event)

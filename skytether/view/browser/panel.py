@@ -357,7 +357,7 @@ class _Network:
 
     Args:
         number: number of the path, from 1.
-        ask, cut, heal: change, cut and heal this path.
+        ask, cut, heal: functions that change, cut and heal this path.
         labels: names of both directions.
     """
 
@@ -523,7 +523,7 @@ class Controls:
             flight.cut(netems)
 
     def _cut_alone(self, netem: str) -> None:
-        """Cut the path of a netem; ask first if it is the last one that carries packets."""
+        """Cut the path of a netem; ask for confirmation first if no other path carries packets."""
         cut = partial(self._cut_all, (netem,))
         if any({*each.netems} <= {netem, *each.cuts} for each in self._flights):
             self._question.ask("Cut the last path?", "Yes, cut it", cut)

@@ -86,7 +86,7 @@ class Player:
         for _, place, process, frame in self._frames[self._next : until]:
             self._flights[place].take(process, frame)
         self._next = max(self._next, until)
-        self._at_ns = at_ns  # set last: a page drawn in between would show the link as cut
+        self._at_ns = at_ns  # set last: until the frames are applied, the link would seem cut
 
     def _work(self) -> None:
         before_s = time.monotonic()

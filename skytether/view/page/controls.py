@@ -113,7 +113,7 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
     """Functions of a slider for the first argument of an impairment in both directions.
 
     Args:
-        names: names of impairments; the one in a direction's text is changed.
+        names: names of impairments; the argument is that of the impairment in a direction's text.
         scale: factor from the argument to the slider's number.
     """
 
@@ -133,7 +133,7 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
 
 
 def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
-    """Functions of a slider for one number of a list with one per axis; an empty list means 0."""
+    """Functions of a slider for one axis of a key that lists a number per axis; empty means 0."""
 
     def write(values: Values, number: float) -> dict[str, Any]:
         numbers = list(values[key]) or [0.0] * axes
@@ -152,7 +152,7 @@ def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
 def _argument(
     name: str, unit: str, hint: str, at: str, low: float, high: float, step: float
 ) -> Knob:
-    """Slider for an argument of the trigger; with a step of 1 or more, only integers."""
+    """Slider for an argument of the trigger, which is an integer if `step` is 1 or more."""
     key = f"control.trigger.{at}"
 
     def write(_: Values, number: float) -> dict[str, Any]:

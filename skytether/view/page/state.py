@@ -55,7 +55,7 @@ SLOTS_MAX = 1200
 stored."""
 VEHICLES_MAX = 64
 ZONED, GUIDED = "mission.zones", "mission.goals"
-"""Keys of a mission's zones, and of its goals changed in flight."""
+"""Key of a mission's zones, and key of the goals that were changed in flight."""
 PLANS_MAX = 8
 """Number of stored plans of a vehicle, including retransmissions."""
 SAID_MAX = 50
@@ -77,7 +77,7 @@ ONLY_SERVER = "only the server has sent data of this vehicle"
 VALUES = ("position", "reference", "figure", "threshold", "age_s", "solve_ms", "mode")
 """Columns of a vehicle's ring buffer; a value is NaN where it is unknown."""
 ROUNDING = 1e-6
-"""Rounding tolerance of times, relative to the length of a slot."""
+"""Rounding tolerance of times, relative to the length of a slot of the ring buffer."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -644,7 +644,7 @@ class State:
 
     @property
     def missing(self) -> tuple[str, ...]:
-        """Roles without a process, and clients of vehicles that only a server reports."""
+        """Roles that no process has, and clients of vehicles that only a server reports."""
         if not self.flies:
             return ()
         roles = {each.role for each in self._processes.values()}

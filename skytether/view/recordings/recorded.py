@@ -71,7 +71,7 @@ class Recorded:
 
     @property
     def can_be_explained(self) -> bool:
-        """Whether the flight can be flown again; over UDP, from the packets at both ends."""
+        """Whether the flight can be flown again; over UDP, both ends' packets are needed for it."""
         return not self.about.began or (ends.PART in self.parts and not self.scenario.keeps_apart)
 
     @property

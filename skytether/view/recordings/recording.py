@@ -163,7 +163,7 @@ class Recording:
         self._add(f"{FEED}{process}", ENCODING, 0, feed.pack(frame))
 
     def _add_twice(self, topic: str, content: bytes) -> None:
-        """Add a topic's first message, without which the others cannot be read, and its copy."""
+        """Add the first message of a topic, without which the topic is unreadable, and its copy."""
         self.flush()
         self._add(topic, ENCODING, 0, content)
         self.flush()

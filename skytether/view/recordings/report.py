@@ -350,7 +350,7 @@ def _trigger(below: "Axes", flown: ReportedFlight) -> None:
     style: Any = {"color": "#0072b2", "linewidth": 0.8, "transform": bottom, "label": "sent"}
     below.vlines(sent, 0.0, 0.12, **style)
     threshold = server["threshold"][np.isfinite(server["threshold"])]
-    # While nothing can be sent, the figure grows by decades: the axis is linear to the threshold.
+    # Logarithmic above the threshold: while nothing can be sent, the figure grows by decades.
     below.set_yscale("symlog", linthresh=max(threshold.max(initial=0.0), 1e-6))
     below.set_ylim(bottom=0.0)
 
