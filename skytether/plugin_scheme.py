@@ -1,7 +1,7 @@
-"""Names that a plug-in with a scheme imports, beside those of `skytether.plugin`.
+"""Names that a plug-in with a scheme imports, in addition to the names of `skytether.plugin`.
 
-They have a module of their own, because they import the server's packages, which other plug-ins do
-not need. docs/schemes.md shows such a plug-in.
+This module also imports the server's packages, which other plug-ins do not need; so the names are
+not in `skytether.plugin`. docs/schemes.md shows a plug-in with a scheme.
 """
 
 from skytether.server.planning.scheme import Batch, Fleet, Foresight, Header, Scheme, SentPlans

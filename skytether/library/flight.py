@@ -52,7 +52,7 @@ class Column(NamedTuple):
     name: str
     shape: tuple[int, ...]
     unit: str
-    """Unit; empty for counts, flags and ratios."""
+    """Unit of the array; empty for counts, flags and ratios."""
 
 
 class Flight:
@@ -124,7 +124,7 @@ class Flight:
 
     @property
     def events(self) -> tuple[FlightEvent, ...]:
-        """Events of the flight in order: time of flight [s], process, and the event."""
+        """Events in order of time, each with its time of flight [s] and the name of its process."""
         return self.record.events
 
     @property

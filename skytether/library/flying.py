@@ -181,12 +181,12 @@ def _laid(keys: Mapping[str, Any], table: dict[str, Any]) -> dict[str, Any]:
 
 
 def _plain(value: Any) -> Any:
-    """Python value of a numpy number or array; text of anything else, such as a path."""
+    """Python value of a numpy number or array; the text of any other value, such as a path."""
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 def _check_server(server: Endpoint, *, udp: bool, secure: bool) -> None:
-    """Refuse a user's endpoint that cannot be the server.
+    """Refuse a user's endpoint that cannot replace Skytether's server.
 
     Raises:
         ConfigError: a flight over UDP or with encryption needs Skytether's server.

@@ -17,7 +17,7 @@ def chunks(severity: int, text: str, number: int) -> list[Message]:
 
     Args:
         severity: MAV_SEVERITY.
-        number: id of the text from 1 to 65535, which its chunks share.
+        number: id of the text, from 1 to 65535; all chunks of the text have this id.
     """
     encoded = text.encode()
     parts = [encoded[at : at + CHUNK_BYTES] for at in range(0, len(encoded), CHUNK_BYTES)]

@@ -278,7 +278,7 @@ def effective(count: int, correlations: Array) -> float:
 
 
 def correlation_time_s(apart_s: Array, correlations: Array, count: int) -> float:
-    """Time after which the autocorrelation is 1/e [s]; 0 without significant correlation."""
+    """Time after which the autocorrelation is 1/e [s]; 0 if no correlation is significant."""
     if not len(correlations) or correlations[0] < max(4.0 / sqrt(count), 0.02):
         return 0.0
     low = np.flatnonzero(correlations < max(0.1, 2.0 / sqrt(count)))
@@ -301,7 +301,7 @@ def wilson(share: float, count: float) -> tuple[float, float]:
 
 
 def bursts(lost: Flags) -> tuple[int, float]:
-    """Number of runs of lost packets, and their mean length [packets]; both 0 without a loss."""
+    """Number of runs of lost packets, and their mean length [packets]; 0 and 0 without losses."""
     edges = np.diff(lost.astype(np.int8), prepend=0)
     count = int((edges == 1).sum())
     return count, float(lost.sum()) / count if count else 0.0

@@ -36,14 +36,14 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 SESSIONS_MAX = 16
-"""Largest number of simultaneous measurements; `Listener._gives_way` makes room for another."""
+"""Largest number of simultaneous measurements; for a new one, `Listener._gives_way` may end one."""
 IDLE_NS = 60 * SECOND_NS
 """Time without a probe after which a measurement may be replaced by another [ns]."""
 HISTORY_MAX = 65_536
 """Largest number of stored arrivals that the prober has not acknowledged; older ones are
 dropped."""
 HOLD_NS = 200 * MILLISECOND_NS
-"""Time to wait for the rest of a train after each of its packets [ns]."""
+"""Longest wait for the next packet of a train [ns]."""
 _ARRIVALS_MAX = PAYLOAD_BYTES_MAX // 12
 
 
@@ -68,7 +68,7 @@ class ProbeSession:
     log: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=HISTORY_MAX))
     """Newest arrivals not yet acknowledged by the prober: number of the PROBE, and time [ns]."""
     train: list[HeldPacket] = field(default_factory=list)
-    """Received packets of a train, answered once the rest has arrived."""
+    """Received packets of a train, which are answered once the whole train has arrived."""
     train_ns: int = 0
     """Time of the newest packet in `train` [ns]."""
 
@@ -85,7 +85,7 @@ class Listener(Endpoint):
         super().__init__()
         self._gate, self._secret = gate, secret
         self._sessions: OrderedDict[bytes, ProbeSession] = OrderedDict()
-        """Measurements by session id, in order of their newest probe, oldest first."""
+        """Measurements by session id; the measurement that has been idle longest is first."""
         self._dropped: Counter[str] = Counter()
         self._answered = 0
 
@@ -144,8 +144,8 @@ class Listener(Endpoint):
         """Id of the session to end for a new sender's session; None if no session may end.
 
         A session without a probe for IDLE_NS is the first to end. Otherwise the host with the most
-        sessions loses its oldest one, if the sender's host has at least two fewer. So no host can
-        block others.
+        sessions loses its oldest session, if the sender's host has at least two sessions fewer. So
+        no host can block others.
         """
         name, session = next(iter(self._sessions.items()), (None, None))
         if session is None or now_ns - session.heard_ns > IDLE_NS:

@@ -44,7 +44,7 @@ class RoundTrips:
 
 class OutageFigures(msgspec.Struct, frozen=True):
     share: float
-    """Share of the covered time in which the path was out; in `common`, all paths."""
+    """Share of the covered time in which the path was out, or for `common` all paths were out."""
     count: int
     longest_s: float
 

@@ -52,7 +52,7 @@ class DirectionFigures(msgspec.Struct, frozen=True, kw_only=True):
     correlation: list[tuple[float, float]]
     """For each lag, time between two packets [s] and correlation of their delays."""
     correlation_s: float
-    """Time in which the correlation falls to 1/e [s]; 0 without significant correlation."""
+    """Time in which the correlation falls to 1/e [s]; 0 if no correlation is significant."""
     rate_bytes_per_s: float | None
     """Rate of the bottleneck, with headers [B/s]; None if trains give no finite rate."""
     rate_low: float | None
@@ -73,7 +73,7 @@ class PathFigures(msgspec.Struct, frozen=True, kw_only=True):
     """Figures of a path, as written with --json."""
 
     listener: str
-    """Address of the other end, or LOCAL=HOST:PORT, or names of the files that were read."""
+    """Address of the listener, or its path LOCAL=HOST:PORT, or the names of the log files."""
     secure: bool
     log: Literal["", "round trips", "one way"]
     """Kind of the log's times; "" for a measurement. A direction gets half of a round trip."""

@@ -23,7 +23,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
 
 VERSION = 64
-"""Protocol version; differs from the version of flights, so that their endpoints reject probes."""
+"""Protocol version. It differs from that of flights, so that endpoints of flights reject probes."""
 NONCE_BYTES = COOKIE_BYTES = 8
 SESSION_BYTES = NONCE_BYTES + COOKIE_BYTES
 MESSAGE_BYTES_MIN = 96
@@ -76,7 +76,7 @@ class ProbeAnswer(NamedTuple):
     logged: int
     """Number of arrivals at the listener so far."""
     arrivals: tuple[tuple[int, int], ...]
-    """Reported arrivals: number of the PROBE and the listener's time [ns]."""
+    """Reported arrivals: PROBE's number, and time of arrival on the listener's clock [ns]."""
 
 
 Message = ProbeHello | ProbeWelcome | Probe | ProbeAnswer
@@ -87,8 +87,8 @@ def encode(message: Message, size: int = 0) -> bytes:
     """Encoded message.
 
     Args:
-        size: size to pad to [B]; the result may be one byte shorter. An ANSWER omits arrivals that
-            do not fit.
+        size: size of the padded message [B]; the result may be one byte shorter. An ANSWER omits
+            arrivals that do not fit.
     """
     fields: tuple[Any, ...] = message
     if isinstance(message, ProbeAnswer):

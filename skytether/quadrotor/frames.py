@@ -137,10 +137,11 @@ SIH = Frame(
     rate_gain=60.0,
     rate_damping=3.0,
 )
-"""Vehicle of PX4's simulation in hardware: `sih_params.c` of PX4 1.17, rotors as in rotorpy.
+"""Vehicle of PX4's simulation in hardware: `sih_params.c` of PX4 1.17.
 
-PX4's drag of 1 N per m/s is used here as rotor drag in hover. Largest rotor speed: 1000 rad/s.
-PX4's simulation has no battery model; the battery here is that of the 1.5 kg frame.
+PX4's drag of 1 N per m/s is used here as rotor drag in hover. The largest rotor speed, 1000 rad/s,
+is as in rotorpy. PX4's simulation has no battery model; the battery here is that of the 1.5 kg
+frame.
 """
 
 FRAMES = {"crazyflie": CRAZYFLIE, "1.5kg": KG15, "sih": SIH}

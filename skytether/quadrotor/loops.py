@@ -63,8 +63,8 @@ ARDUPILOT = Gains(
     integral_max=10.0,
     tilt_max=0.52,
 )
-"""ArduCopter 4.5: its defaults PSC_JERK_XY, WPNAV_ACCEL, PSC_JERK_Z, WPNAV_ACCEL_Z, PSC_POSXY_P,
-PSC_VELXY_P, _I, _D and _IMAX, PSC_VELZ_P and _IMAX, and ANGLE_MAX."""
+"""Gains of ArduCopter 4.5: defaults of PSC_JERK_XY, WPNAV_ACCEL, PSC_JERK_Z, WPNAV_ACCEL_Z,
+PSC_POSXY_P, PSC_VELXY_P, _I, _D and _IMAX, PSC_VELZ_P and _IMAX, and ANGLE_MAX."""
 
 PX4 = Gains(
     jerk=0.0,
@@ -80,9 +80,9 @@ PX4 = Gains(
     integral_max=GRAVITY,
     tilt_max=0.785,
 )
-"""PX4 1.17: its defaults MPC_XY_VEL_P_ACC, _I_ACC and _D_ACC, MPC_Z_VEL_P_ACC and _I_ACC and
-MPC_TILTMAX_AIR. An external velocity set-point is not shaped. PX4 limits the vertical integral to
-g, and the horizontal integral by the largest tilt, here 45°: also g."""
+"""Gains of PX4 1.17: defaults of MPC_XY_VEL_P_ACC, _I_ACC and _D_ACC, MPC_Z_VEL_P_ACC and _I_ACC
+and MPC_TILTMAX_AIR. An external velocity set-point is not shaped. PX4 limits the vertical integral
+to g, and the horizontal integral by the largest tilt, here 45°: also g."""
 
 CRAZYFLIE = Gains(
     jerk=0.0,
@@ -98,9 +98,9 @@ CRAZYFLIE = Gains(
     integral_max=5.0,
     tilt_max=0.349,
 )
-"""Crazyflie's firmware: its defaults of `position_controller_pid.c`, converted to accelerations.
-Gains P and I: 25° and 1° of tilt per m/s, at most 20°; vertically, 25 000 and 15 000 of 65 535
-units of thrust. Its integrals do not reach their limits; 5 m/s² is assumed."""
+"""Gains of the Crazyflie's firmware: `position_controller_pid.c`, converted to accelerations. Gains
+P and I: 25° and 1° of tilt per m/s, at most 20°; vertically, 25 000 and 15 000 of 65 535 units of
+thrust. The integrals do not reach their limits, here assumed as 5 m/s²."""
 
 AHEAD_MAX_M = 2.0
 """Largest position error ∫(v* - v) dt, on each axis [m]."""

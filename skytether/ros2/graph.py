@@ -29,7 +29,7 @@ NAME_AT, PARTS = 8, 13
 @dataclass(frozen=True, slots=True)
 class Topic:
     name: str
-    """Name with its namespace, as in `/cmd_vel`."""
+    """Name of the topic with its namespace, as in `/cmd_vel`."""
     kind: str
     """Type of the topic's messages, as in `geometry_msgs/msg/Twist`."""
     type_hash: str
@@ -62,8 +62,8 @@ class Node:
 
     @property
     def forms(self) -> tuple[Topic, ...]:
-        """The published topic, once for each message type that it may have. A message to publish
-        has as its peer the topic's name and the index of its type in this list.
+        """The published topic with each message type that it may have. The peer of a message to
+        publish is the topic's name and the index of the message's type in this list.
         """
         return self.publishes, *self.alternatives
 

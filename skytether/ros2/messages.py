@@ -1,4 +1,4 @@
-"""Messages of ROS 2, encoded and decoded in CDR by rosbags: only the types that Skytether uses."""
+"""Messages of the ROS 2 types that Skytether uses, encoded and decoded in CDR by rosbags."""
 
 import math
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ UNIT = 0.01
 
 Vector = tuple[float, float, float]
 Rotation = tuple[Vector, Vector, Vector]
-"""Rotation matrix by rows, from a robot's axes to those of its fixed frame; shape (3, 3)."""
+"""Rows of the rotation matrix from a robot's axes to its fixed frame's axes; shape (3, 3)."""
 
 
 class MessageError(ValueError):
@@ -126,7 +126,7 @@ def twist_stamped(stamp_ns: int, frame: str, linear: Vector, turn: float) -> byt
 
 
 def path(stamp_ns: int, frame: str, positions: Sequence[Vector]) -> bytes:
-    """Encode nav_msgs/Path: positions in a frame [m], all with the same time stamp, not rotated."""
+    """Encode nav_msgs/Path: positions in a frame [m], one time stamp for all, no rotations."""
     types: Any = STORE.types
     point, pose, stamped = (types[f"geometry_msgs/msg/{name}"] for name in POSE_PARTS)
     level = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)

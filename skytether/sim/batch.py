@@ -1,4 +1,4 @@
-"""Flights of one scenario with many seeds, which share a server. Their records equal those of
+"""Flights of one scenario with many seeds, which share a server. The records equal the records of
 single flights; `sim.flight` explains why.
 """
 

@@ -17,7 +17,7 @@ class WithStandby(Alone):
     """Servers of a flight: a server and its standby.
 
     Args:
-        standby: endpoint in place of the standby server; True: a `Server`.
+        standby: endpoint that is the standby server; if True, a `Server` is made.
     """
 
     def __init__(self, standby: Endpoint | bool) -> None:

@@ -1,8 +1,8 @@
 """World: hosts in virtual time that can be stopped, restarted and frozen, and whose clocks can be
 set.
 
-The state that an endpoint saves survives a restart of its host. `sim.hosts` has the clocks, the
-agenda and its order.
+The state that an endpoint saves survives a restart of its host. `sim.hosts` has the clocks and the
+queue of future events.
 """
 
 from collections import deque
@@ -14,8 +14,7 @@ from skytether.shared.events.flight import Event
 from skytether.sim.hosts import Clock, Host, Hosts
 
 FROZEN_MAX = 6_500
-"""Largest number of datagrams queued for a frozen host: a socket's buffer holds 6500 of 600 B.
-"""
+"""Capacity of a frozen host's queue: a socket's buffer holds 6500 datagrams of 600 B."""
 
 
 def changed(clock: Clock, time_ns: int, *, step_ns: int = 0, drift_ppb: int | None = None) -> Clock:
@@ -133,8 +132,7 @@ class World(Hosts):
 
         Args:
             step_ns: step of the clock, forward or back [ns].
-            drift_ppb: rate by which the clock runs faster than the world's time [10⁻⁹]; None keeps
-                it.
+            drift_ppb: rate by which the clock gains on the world's time [10⁻⁹]; None: no change.
         """
         host = self._hosts[name]
         host.clock = changed(host.clock, self.now_ns, step_ns=step_ns, drift_ppb=drift_ppb)

@@ -15,7 +15,7 @@ observations. The theorem does not promise that vehicles arrive; `waits` finds w
 | `hypotheses` | each condition and each promise, with its least margin |
 | `waits` | which vehicle waited for which, and for which packet |
 
-**Contract.** The package flies no flight, and registers no names. A condition that the record does
+**Contract.** The package runs no flights, and registers no names. A condition that the record does
 not determine is reported as not checked. The package imports `shared`, a bound of the client's
 failsafe, and `sim` for the waits that the server reports in flight.
 """

@@ -280,7 +280,7 @@ def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothes
 
 
 def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that the server observed all vehicles first; margin: time until a vehicle moved."""
+    """Check that all vehicles were observed before one moved; margin: the time between [s]."""
     name, mission = "the server observes all first", scenario.make_reference()
     assert isinstance(mission, Mission)
     server = record.server

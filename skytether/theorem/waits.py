@@ -36,7 +36,7 @@ OTHER = re.compile(r"vehicle (\d+)( to pass)?|a zone")
 Reason: TypeAlias = tuple[float, int, str]
 """Time of flight [s], vehicle, and the server's text about what the vehicle waits for."""
 Question: TypeAlias = tuple[float, Callable[[World], None]]
-"""Action in a flight: time [s], and the function called then; see `flight.fly`."""
+"""Action in a flight: time [s], and function that is called at this time; see `flight.fly`."""
 Kind = Literal["to begin", "acknowledgement", "way"]
 
 
@@ -50,7 +50,7 @@ class Wait:
     """Time of flight at which the wait begins [s]."""
     for_s: float
     other: int = 0
-    """Number of the vehicle that is waited for; 0 if it is none, as in a wait for a zone."""
+    """Number of the vehicle that is waited for; 0 if there is none, as in a wait for a zone."""
     motion_s: float = math.nan
     """Time at which the server sent the unacknowledged motion of `vehicle` or of `other` [s]."""
     plans: tuple[int, int] = (0, 0)
@@ -77,8 +77,7 @@ class _Vehicle:
     sent_at: Indices
     """Number of the tick at which each motion was sent first."""
     heard_at: Indices
-    """Number of the tick at which the server knew whether a motion was accepted, or the last
-    one."""
+    """Tick number at which the server knew whether a motion was accepted, or the last tick."""
     is_heard: Flags
     """Whether the server knew at the tick in `heard_at` if the motion was accepted."""
     accepted: Indices

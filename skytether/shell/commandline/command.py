@@ -142,7 +142,7 @@ def paths(flag: str, texts: Sequence[str], *, needs_local: bool = True) -> list[
     """Paths given to a flag, each as LOCAL=HOST:PORT.
 
     Args:
-        needs_local: whether HOST:PORT alone is refused.
+        needs_local: whether HOST:PORT without LOCAL is refused.
     """
     check_count(flag, len(texts), PATHS_MAX)
     parsed: list[NetworkPath] = []
@@ -248,7 +248,7 @@ def interruptible() -> Iterator[Callable[[], bool]]:
 
 
 def main(command: Callable[[Sequence[str]], None], argv: Sequence[str] | None, prog: str) -> int:
-    """Run a command, with one line on stderr if it fails; returns its exit code."""
+    """Run a command, and print one line on stderr if it fails; returns the command's exit code."""
     try:
         try:
             with extras.named(), files.apart():

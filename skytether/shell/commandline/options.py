@@ -28,7 +28,7 @@ T = TypeVar("T")
 
 
 def read(default: T, argv: Sequence[str], prog: str, help_: str | None) -> T:
-    """Options of a command line, completed from `default`; `help_` is the help's first text.
+    """Options of a command line, completed from `default`; `help_` describes the command.
 
     Raises:
         ConfigError: a flag is wrong, or a plug-in cannot be imported.

@@ -1,7 +1,7 @@
 """Plug-ins: users' Python code that adds names for scenarios (`shared.scenario.registry`).
 
 A plug-in is a file (`--plugin FILE`), or an installed package that declares entry points. Plug-ins
-are imported before a scenario is read; processes that a command starts get the same files. A
+are imported before a scenario is read; the child processes of a command import the same files. A
 plug-in runs with all rights of the user.
 """
 

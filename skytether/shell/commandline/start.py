@@ -22,7 +22,7 @@ def run(command: str, prog: str, argv: Sequence[str] | None = None) -> int:
     Args:
         command: the command's function as "module:name", imported here.
         prog: name of the command, for errors.
-        argv: arguments; those of the process if None.
+        argv: arguments; if None, the arguments of the process.
     """
     begin()
     module, _, name = command.partition(":")

@@ -3,7 +3,7 @@
 Each connected client gets its own connection to the server. Pieces of data from both go to the
 endpoint as datagrams with the peers `(CLIENT, number)` and `(SERVER, number)`; an empty piece means
 that the peer has sent its last data. While HELD_MAX pieces of a peer are under way, its socket is
-not read, so that TCP slows the peer. If a peer resets its connection, the other is reset, too.
+not read, so that TCP slows the peer. If one connection is reset, the other is reset, too.
 """
 
 import asyncio

@@ -1,8 +1,8 @@
 """Control socket: a Unix socket, usable only by its owner, through which keys change in flight.
 
-Each datagram is a request (`shared.endpoints.change`); its answer is sent to its sender. The socket
-pauses after each request, so that a flood of requests delays the sender, not the endpoint. An
-answer that cannot be delivered is dropped.
+Each datagram is a request (`shared.endpoints.change`); the answer is sent back to the sender. The
+socket pauses after each request, so that a flood of requests delays the sender, not the endpoint.
+An answer that cannot be delivered is dropped.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ ANSWER_BYTES_MAX = 65_536
 
 
 class ControlError(OSError):
-    """A control socket gave no answer, or a wrong one; the message has the reason."""
+    """A control socket gave no answer, or an invalid answer; the message has the reason."""
 
 
 class Control:

@@ -2,7 +2,7 @@
 
 asyncio and signals are used only here and in `shell.host.timer`, sockets only in `shell.host.udp`
 and `shell.host.batch`. The shell has no knowledge of control or protocol: it passes datagrams and
-time to the endpoint, and sends the endpoint's datagrams and events.
+time to the endpoint, sends the endpoint's datagrams, and reports its events.
 """
 
 import asyncio
@@ -187,7 +187,7 @@ class Shell:
                 self._add(line)
             failed.pop_all()
         self._buffer = memoryview(bytearray(DATAGRAM_BYTES_MAX))
-        """Buffer into which all datagrams are read; faster than allocating one per datagram."""
+        """Buffer into which all datagrams are read: faster than a new buffer for each datagram."""
         self._batches: dict[int, DatagramBatch | None] = {}
         self._patience_ns = endpoint.patience_ns
         self._arrivals: dict[int, Arrivals] = {}
@@ -367,8 +367,8 @@ class Shell:
         """Read the datagrams at each socket that is read in batches, in at most BATCHES_MAX calls
         per socket.
 
-        Waking the process for each datagram would take twice the time, because its caches are cold.
-        The arrival times are the kernel's timestamps.
+        Waking the process for each datagram would take twice the time, because caches are cold
+        then. The arrival times are the kernel's timestamps.
         """
         is_left, nothing_came = False, list[int]()
         came: list[tuple[int, Datagram]] = []
@@ -552,7 +552,7 @@ class Shell:
         while any(names.may_change for names in all_names):
             await asyncio.sleep(RESOLVE_EVERY_S)
             addresses: asyncio.Future[list[Numbers]] = self._loop.create_future()
-            # Not in an executor, for whose lookup the event loop would wait up to 20 s at its end.
+            # In a thread: at its end, an event loop waits up to 20 s for a lookup in an executor.
             work = all_names, addresses
             threading.Thread(target=self._look_up, args=work, daemon=True).start()
             self._learn(all_names, await addresses)

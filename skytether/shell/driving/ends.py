@@ -22,7 +22,7 @@ class Watched(Steady):
     """Endpoint whose wakes and datagrams are recorded.
 
     Args:
-        line: number of the socket that leads to an autopilot or a robot; None without one.
+        line: number of the socket that leads to an autopilot or a robot; None if there is none.
         clock_ns: the driver's clock.
     """
 

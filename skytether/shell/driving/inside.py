@@ -93,7 +93,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _end_with_parent() -> None:
-    """Let the kernel kill this process when its parent ends, until its credentials change."""
+    """Let the kernel kill this process when the parent ends; new credentials would undo this."""
     _call(_libc.prctl, _PR_SET_PDEATHSIG, signal.SIGKILL)
 
 

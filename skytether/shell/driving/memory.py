@@ -5,8 +5,8 @@
 A thread writes a new file and renames it, so that no step waits for a disk and the file is always
 complete. If a write fails while the endpoint waits for it, the file is removed, so that the next
 run uses no old state, and the endpoint goes on. If the file cannot be removed (read-only disk), the
-next run refuses it, and so it refuses a damaged file and a file of another vehicle, key or flight.
-The file need not survive a reboot, because a reboot takes longer than any motion.
+next run refuses it. The next run also refuses a damaged file, and another vehicle's, key's or
+flight's file. The file need not survive a reboot, because a reboot takes longer than any motion.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ FILE_BYTES_MAX = 65_536
 BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 """File with the host's boot id, on Linux; the monotonic clock restarts at each boot."""
 DISK_FAILED = {EROFS, EIO}
-"""Errors of a failed disk. A full disk is not one, because the empty lock file still fits."""
+"""Errors of a failed disk. A full disk does not count as failed: the lock file is empty."""
 AGAIN_S = 1.0
 """Time after which a failed write is repeated [s]."""
 
@@ -47,7 +47,7 @@ class _Envelope(msgspec.Struct, frozen=True, array_like=True):
     written_ns: int
     """Time of writing [ns; monotonic clock of the host]."""
     identity: dict[str, str]
-    """Facts that identify the writer, by name: vehicle, flight. The reader's must be equal."""
+    """Facts that identify the writer, by name: vehicle, flight. The reader has equal facts."""
     content: bytes
 
 
@@ -105,7 +105,7 @@ class MemoryFile:
         return self._path
 
     def read(self) -> tuple[bytes, int | None] | None:
-        """Content saved by the previous run, and the time of writing; None without a file.
+        """Content saved by the previous run, and the time of writing; None if there is no file.
 
         The time is that of the host's monotonic clock [ns]; None if the host was rebooted since.
         The content is written again, as a test: a file that cannot be replaced may be older than

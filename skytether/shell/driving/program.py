@@ -48,8 +48,8 @@ exec "$@" 9<&-
 """
 """Shell script that raises the limit of open files (slirp4netns needs one per flow), starts a guard
 that kills slirp4netns when netem ends, and becomes slirp4netns. Only netem and the guard have the
-ends of its standard input, so each sees the other end. `--exit-fd` has no effect before netem
-connects."""
+two ends of the script's standard input, so each notices when the other ends. `--exit-fd` has no
+effect before netem connects."""
 FRAME_BYTES_MAX = 65_536
 WAITING_MAX = 16_384
 """Largest number of packets waiting for slirp4netns; further packets count as send errors."""
@@ -86,7 +86,7 @@ class Program:
         self.control.send(START)
 
     def signal(self, number: int) -> None:
-        """Send a signal to the program; after the program's end, it ends the remaining children."""
+        """Send the program a signal; after the program's end, any signal ends its children."""
         with suppress(OSError):
             self.control.send(bytes([number]))
         if number == signal.SIGTSTP:  # the shell waits until netem has stopped, too
@@ -100,7 +100,7 @@ def program(
     """Create namespaces for a program, which starts with `Program.start` and ends with the block.
 
     Args:
-        mtu: MTU of its device [B].
+        mtu: MTU of the program's device [B].
         path_mtu: largest packet that slirp4netns sends to the program [B].
         exposed: addresses on this machine; TCP and UDP to them go to the same port of the program.
 

@@ -126,7 +126,7 @@ class _Headers:
         """Sizes of the control data [B]; the kernel sets each to the size that it has written."""
         words = memoryview(stamps).cast("q")
         self.stamps_s, self.stamps_ns = words[2 :: _STAMP.size // 8], words[3 :: _STAMP.size // 8]
-        """Arrival times by CLOCK_REALTIME: seconds, and the rest [ns]; shape (BATCH_MAX,)."""
+        """Arrival times by CLOCK_REALTIME: whole seconds, and nanoseconds; shape (BATCH_MAX,)."""
 
 
 def _address(memory: bytearray | mmap.mmap) -> int:
@@ -173,7 +173,7 @@ class DatagramBatch:
         Returns:
             payloads, senders, and arrival times [ns; CLOCK_MONOTONIC], in the order of arrival; all
             empty if there was no datagram, or an error. Arrival times are converted from the
-            kernel's time of day, so a step of this clock shifts them by the step. A datagram
+            kernel's time of day, so a step of this clock shifts them by as much. A datagram
             without an arrival time gets the present time.
         """
         rows, size = self._in, self._name_bytes

@@ -1,8 +1,8 @@
 """Compilation of kernels, with one process per core.
 
-Numba compiles one function at a time in a process. So other processes compile beside this one,
-which then reads the machine code that they stored on disk. Each process takes the next kernel from
-a queue, because compile times are not known beforehand. A second command waits for the first, and
+Numba compiles one function at a time in a process. So other processes compile at the same time, and
+store machine code on disk, which this process then reads. Each process takes the next kernel from a
+queue, because compile times are not known beforehand. A second command waits for the first, and
 loads what the first has compiled.
 """
 

@@ -7,7 +7,7 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Event, Omitted
 
 KIND_MAX = 5
-"""Largest number of events of a kind that are logged in a second; the others are counted."""
+"""Largest number of events of a kind that are logged in a second; further ones are counted."""
 
 
 @dataclass(slots=True)

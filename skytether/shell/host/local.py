@@ -1,4 +1,4 @@
-"""Unix sockets that only their owner can use; closing removes them."""
+"""Unix sockets that only their owner can use; closing a socket removes its file."""
 
 import os
 import socket

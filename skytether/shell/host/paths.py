@@ -85,8 +85,8 @@ class PathSockets:
     def choose_address(self) -> bool:
         """Choose the address that sockets are bound to; returns whether it has changed.
 
-        Called only at the start, and when the peer's name is resolved late: otherwise a plaintext
-        link, allowed because it is local, could become remote when a name moves to another machine.
+        This is done only at the start, and when the peer's name is resolved late. Otherwise a
+        plaintext link that is allowed because it is local could become remote when a name is moved.
         """
         before, is_address = self._bind, self.path.local and not self._interface
         self._bind = (self.path.local, 0) if is_address else within_reach_of(self.names.numbers())
@@ -104,11 +104,11 @@ class PathSockets:
 
     @property
     def is_outdated(self) -> bool:
-        """Whether there is no socket yet, or it is bound to an interface that was removed."""
+        """Whether no socket was opened yet, or the socket's interface was removed since."""
         return self._index != self._index_now()
 
     def _index_now(self) -> int:
-        """Kernel's index of the path's interface; 0 without an interface, or if it is missing."""
+        """Kernel's index of the path's interface; 0 if there is no such interface."""
         try:
             return socket.if_nametoindex(self._interface) if self._interface else 0
         except OSError:

@@ -20,7 +20,7 @@ if TYPE_CHECKING:  # `start` imports this module first, so it imports nothing sl
 
 
 def _module(name: str) -> Any:
-    """Module of the standard library; None if this system lacks it."""
+    """Module of the standard library; None if this system lacks the module."""
     try:
         return import_module(name)
     except ImportError:

@@ -70,7 +70,7 @@ def _clear_one(made: Path) -> None:
 
 
 def _remove(made: Path) -> None:
-    """Remove a folder, its mark last; if a process still writes to it, a later call removes it."""
+    """Remove a folder, its mark last. A folder that is still written to is left to a later call."""
     with contextlib.suppress(OSError):
         for entry in made.iterdir():
             if entry.name == MARK:

@@ -29,8 +29,7 @@ class Writer:
         self._capacity = capacity
         self._together = together
         self._pause_s = pause_s
-        # The caller's thread changes `offered` and `refused`, the writer's thread all other
-        # counters.
+        # The caller's thread changes `offered` and `refused`, the writer's thread the rest.
         self.offered = 0
         self.refused = 0
         """Number of bytes that were dropped because too many were waiting."""

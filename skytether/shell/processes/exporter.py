@@ -38,7 +38,7 @@ PATIENCE_S = 5.0
 """Longest time from connecting to the end of the answer [s]."""
 REQUEST_BYTES_MAX = 8192
 POLL_S = 0.1
-"""Interval at which connections that take too long are closed [s]."""
+"""Interval between the checks that close connections that take too long [s]."""
 REST_S = 0.02
 """Pause between two accepted connections [s]."""
 FRESH_S = 3.0
@@ -47,7 +47,7 @@ BY_NAME = b"Host: expected a number, localhost, a name without a dot or that of 
 
 
 class MetricsError(OSError):
-    """Listening at the metrics' address failed; the message says which address and why."""
+    """Listening at the metrics' address failed; the message has the address and the reason."""
 
 
 class Collected(Collector):
@@ -155,7 +155,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(collected)
         self._connections: dict[socket.socket, float] = {}
-        """Time at which each connection is closed, even if unanswered [s]; the oldest first."""
+        """Time at which each connection is closed, even without an answer [s]; oldest first."""
         self._thread = threading.Thread(target=self.serve_forever, args=(POLL_S,), daemon=True)
         self._thread.start()
 

@@ -1,6 +1,6 @@
 """Metrics of a process for Prometheus: tables of names, units and labels, and its health.
 
-Each figure of an endpoint (`Endpoint.figures`) is in a table or in LEFT_OUT. All others are
+Each figure of an endpoint (`Endpoint.figures`) is in a table or in LEFT_OUT. Other figures are
 counted, and fail a test. Names follow Prometheus: base units, `_total` for counters.
 """
 
@@ -66,7 +66,7 @@ class Metric(NamedTuple):
 
 
 def table(text: str) -> tuple[Metric, ...]:
-    """Metrics of a text with two lines for each: figure, name and labels; then the help."""
+    """Metrics of a text with two lines per metric: figure, name and labels; then the help."""
     lines = iter(text.strip().splitlines())
     metrics = []
     for head, description in zip(lines, lines, strict=True):
@@ -298,7 +298,7 @@ LEFT_OUT = {
 def families(
     process: str, figures: Mapping[str, Any], own: Sequence[Metric] = ()
 ) -> tuple[list[Exposed], list[str]]:
-    """Convert figures to metrics; also returns the paths of figures without metric.
+    """Convert figures to metrics; also returns the paths of figures without a metric.
 
     Args:
         process: server, netem or client; other processes have only common metrics.

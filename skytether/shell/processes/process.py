@@ -115,7 +115,7 @@ class Process:
     journal: "Journal | None"
     warnings: list[Event]
     recording: RecordFile | None
-    """File of the endpoint's rows; at its end the process waits until they are written."""
+    """File of the endpoint's rows. The process ends only after all rows are written."""
     feed: "Feed | None"
     recorder: Recorder | None
     """Recorder of the endpoint's rows, for a file, a feed or both; None without file and feed."""
@@ -125,7 +125,7 @@ class Process:
         return _followed(Recorder(columns), self.feed, part, columns) if self.feed else None
 
     def _watched(self, endpoint: Endpoint, line: int | None) -> Endpoint:
-        """The endpoint, wrapped to record its packets in the feed; itself without a feed."""
+        """Endpoint that also records the packets of `endpoint` in the feed, if there is a feed."""
         if self.feed is None or self.secure is None:
             return endpoint
         from skytether.shared.telemetry import ends  # imported only with a feed

@@ -1,7 +1,7 @@
 """Recording of a single process: a recorder process reads its feed and writes an MCAP file.
 
-The flying process does not wait for the disk, and imports no MCAP library. When the flying process
-ends or is killed, the recorder's standard input ends, and the recorder completes its file.
+The recorded process does not wait for the disk, and imports no MCAP library. When the recorded
+process ends or is killed, the recorder's standard input ends, and the recorder completes its file.
 """
 
 import subprocess
@@ -70,7 +70,7 @@ def recorder(
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
-        # Ctrl-C is for the flying process, which then ends the recorder.
+        # Ctrl-C is for the recorded process, which then ends the recorder.
         start_new_session=True,
     )
     assert child.stdin is not None

@@ -26,7 +26,7 @@ from skytether.shell.processes.log import LogFormat
 from skytether.view.browser.serve import followed, serve_until_interrupted
 
 NICE = 5
-"""Niceness of the page's process, which gives the flying processes priority."""
+"""Niceness of the page's process, so that the processes of a flight have priority."""
 
 
 @dataclass(frozen=True)

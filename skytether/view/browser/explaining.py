@@ -25,7 +25,7 @@ from skytether.shell.host import temporary
 from skytether.view.page import words
 
 NICE = 10
-"""Niceness of the explaining processes, which gives the page's process priority."""
+"""Niceness of the explaining processes, so that the page's process has priority."""
 POLL_S = 0.2
 BUTTONS_MAX = 12
 """Largest number of brake events with a button."""
@@ -62,7 +62,7 @@ class Explainer:
         ] or [(None, GRAVEST)]
         self._is_more = len(brakes) > BUTTONS_MAX
         self.findings: dict[float | None, Findings] = {}
-        """Explanations by the requested time of flight [s]; None: the gravest event."""
+        """Explanations by the requested time of flight [s]; by None for the gravest event."""
         self._pool = ThreadPoolExecutor(1)
         self._closed = threading.Event()
 

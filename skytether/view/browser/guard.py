@@ -47,7 +47,7 @@ FRAMES_MAX = 1024
 UNREAD_BYTES = 128 * 1024
 """Requested size of the kernel's send buffer of a connection [B]; the kernel doubles it."""
 RATE_HZ = 200.0
-"""Messages per second that are read from one browser [Hz]; dragging a slider sends 60."""
+"""Messages per second that are read from one browser [Hz]; a dragged slider sends 60 a second."""
 BURST_S = 2.0
 """Largest burst of messages that are read at once, as the time that they take at RATE_HZ [s]."""
 MESSAGES = frozenset(
@@ -248,7 +248,7 @@ class _Connection(sockets.ServerConnection):
         super().process_event(event)
 
     async def recv(self, decode: bool | None = None) -> Any:  # noqa: ARG002 - viser's are bytes
-        """Next message that the page accepts; drops all others.
+        """Next message that the page accepts; other messages are dropped.
 
         Raises:
             ConnectionClosed: the connection has ended.

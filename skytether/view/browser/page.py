@@ -40,7 +40,7 @@ def _silence() -> contextlib.redirect_stdout[io.StringIO]:
 def stop(server: viser.ViserServer) -> None:
     """Stop a viser server, and wait for the end of its thread.
 
-    viser waits only for a second; its thread could print later, in the middle of other output.
+    viser itself waits only for a second; the thread could print later, between other output.
     """
     thread = server._websock_server._server_thread
     with _silence():

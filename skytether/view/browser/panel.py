@@ -61,7 +61,7 @@ WIDE_PLOTS = 760
 NARROW = 800
 """Largest window width at which panels cover the scene instead of standing beside it [pixels]."""
 MOVED_M = 0.05
-"""Distance of the target from its handle above which the handle follows [m]."""
+"""Distance between target and handle [m] above which the handle is moved to the target."""
 LIGHT = "Light page"
 AS_PREFERRED = f"""<img hidden src="data:," onerror="
 const label = [...document.querySelectorAll('label')].find(each => each.textContent === '{LIGHT}');

@@ -133,7 +133,7 @@ def _ways(names: tuple[str, ...], scale: float) -> tuple[Read, Write]:
 
 
 def _component(key: str, axis: int, axes: int) -> tuple[Read, Write]:
-    """Functions of a slider for one axis of a key that lists a number per axis; empty means 0."""
+    """Functions of a slider for one number of a list with one per axis; an empty list means 0."""
 
     def write(values: Values, number: float) -> dict[str, Any]:
         numbers = list(values[key]) or [0.0] * axes

@@ -94,7 +94,7 @@ class Network:
         return int(at)
 
     def _since(self, seconds: float, now_ns: int) -> NDArray[np.bool_]:
-        """Mask of the bins of the last seconds, without the unfinished one."""
+        """Mask of the bins of the last seconds, without the unfinished bin."""
         last = now_ns // BIN_NS
         recent: NDArray[np.bool_] = (self._bin < last) & (
             self._bin >= last - round(seconds * SECOND_NS / BIN_NS)

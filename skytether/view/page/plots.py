@@ -64,7 +64,7 @@ class PlotLine:
     label: str
     values: Values
     rgb: str = ""
-    """Colour of the line; if it is empty, or several flights have the line, the flight's colour."""
+    """Colour of the line. If empty, or if several flights have the line: the flight's colour."""
     dash: tuple[int, ...] = ()
     width: float = 1.5
     once: bool = False

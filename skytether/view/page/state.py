@@ -60,7 +60,7 @@ PLANS_MAX = 8
 """Number of stored plans of a vehicle, including retransmissions."""
 SAID_MAX = 50
 FOLDED_S = 10.0
-"""Time within which events with the same text are shown once, with their number [s]."""
+"""Time within which events with the same text are shown as one, with the number of events [s]."""
 AT_ONCE_S = 2.0
 """Time within which changes of one key, as by a dragged slider, count as one change [s]."""
 LIVE_POINT = "reference.points_m"
@@ -570,7 +570,7 @@ class State:
         return {way: name.replace("_", " ") for way, name in enumerate(self.ways)}
 
     def time_s(self, time_ns: int) -> float:
-        """Time of flight [s] at a time [ns], 0 until a step is flown; for netem alone, its age."""
+        """Time of flight [s], 0 before step 0; for netem alone, the time since netem's start."""
         begin_ns = self.begin_ns
         if begin_ns is None and not self.flies:
             begin_ns = min((each.opened.time_ns for each in self._processes.values()), default=None)
@@ -592,7 +592,7 @@ class State:
 
     @property
     def kept(self) -> Zones:
-        """Zones of a mission; none if their file is on another machine."""
+        """Zones of a mission; empty if the file of the zones is on another machine."""
         try:
             return zone_texts.parse(
                 self.zones, self.scenario.model.axes, reading.files_of("mission.zones", self.zones)
@@ -606,7 +606,7 @@ class State:
         return reason if isinstance(reason, str) else ""
 
     def clock(self, number: int) -> tuple[float, float]:
-        """Uncertainty of a mission vehicle's clock [ms], and of its position because of it [m].
+        """Clock uncertainty of a mission vehicle [ms], and resulting position uncertainty [m].
 
         NaN if the server reports neither.
         """

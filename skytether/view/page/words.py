@@ -302,7 +302,7 @@ def explained(text: str, following: str, refused_: str, command: str) -> str:
 
     Args:
         text: explanation as plain text; indented lines are tables.
-        following: step in progress; empty if the explanation is complete.
+        following: phase in progress; empty if the explanation is complete.
         refused_: reason why there is no explanation.
         command: command that makes the same explanation.
     """

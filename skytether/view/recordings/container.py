@@ -239,7 +239,7 @@ class Container:
 
 
 def _parsed(content: bytes) -> McapRecord | None:
-    """Record in these bytes; None if it is not of a type allowed outside chunks, or too short."""
+    """Record in these bytes; None if it is too short, or its type is not allowed outside chunks."""
     stream = ReadDataStream(BytesIO(content[HEAD.size :]))
     try:
         record: McapRecord = KINDS[content[0]].read(stream)

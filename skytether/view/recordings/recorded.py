@@ -71,7 +71,9 @@ class Recorded:
 
     @property
     def can_be_explained(self) -> bool:
-        """Whether the flight can be flown again; over UDP, both ends' packets are needed for it."""
+        """Whether the flight can be flown again. A flight over UDP needs both ends' packets for
+        this.
+        """
         return not self.about.began or (ends.PART in self.parts and not self.scenario.keeps_apart)
 
     @property
@@ -242,7 +244,7 @@ def _check_begun(scenario: str) -> None:
 
 
 def _failure(events: list[FlightEvent]) -> Failure | None:
-    """Failure of the lowest-numbered vehicle whose last event is a failure; None without any."""
+    """Failure of the lowest-numbered vehicle whose last event is a failure, or None."""
     last: dict[int, Event] = {
         each.event.vehicle: each.event
         for each in events
