@@ -158,7 +158,7 @@ class Hosts:
                 if until():
                     return
                 self._look_ns = self.now_ns + every_ns
-            # Datagrams sent at an earlier time are in the agenda, and arrive first.
+            # Datagrams sent at an earlier time are in `agenda`, and arrive first.
             if arriving and not (agenda and agenda[0][:2] <= (self.now_ns, ARRIVAL)):
                 self._receive(*arriving.popleft())
                 continue

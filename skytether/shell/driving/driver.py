@@ -419,8 +419,8 @@ class Shell:
         if not payloads:
             return []
         self._count(number, len(payloads))
-        # Timestamps can be wrong: CLOCK_REALTIME may be set, and a socket's first datagrams get the
-        # time of reading. Times must not fall: datagrams are read in order of arrival.
+        # Timestamps can be wrong: CLOCK_REALTIME may be changed, and a socket's first datagrams get
+        # the time of reading. Times must not fall: datagrams are read in order of arrival.
         now_ns = time.monotonic_ns()
         stamps_ns = [last_ns := min(max(stamp_ns, last_ns), now_ns) for stamp_ns in came_ns]
         try:

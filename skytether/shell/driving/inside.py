@@ -149,7 +149,7 @@ def _configure(mtu: int) -> None:
         )
         with suppress(subprocess.CalledProcessError):  # a kernel without IPv6
             _ip(f"addr add {ADDRESS6}/64 dev netem nodad", "route add ::/0 dev netem")
-    # Allow ping and ports below 1024: file capabilities, which allow them elsewhere, fail here.
+    # Allow ping and ports below 1024, because file capabilities have no effect in the namespaces.
     group = os.getegid()
     for name, value in (
         ("ping_group_range", f"{group} {group}"),
@@ -194,10 +194,10 @@ def _mount() -> None:
         _call(_libc.mount, b"tmpfs", folder.encode(), b"tmpfs", 0, None)
     real = path.resolve()
     if not real.exists():  # nothing to mount over: this machine resolves no names
-        if str(real.parent) in RESOLVERS:  # a private folder since the mount above
+        if str(real.parent) in RESOLVERS:  # the mount above made the folder private
             real.write_text(text)
         return
-    if text == before:  # within another `netem run`: a file that cannot be mounted over
+    if text == before:  # as within another `netem run`, where it cannot be mounted over
         return
     with tempfile.NamedTemporaryFile("w") as file:  # the file is deleted, its mount remains
         file.write(text)

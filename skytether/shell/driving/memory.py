@@ -223,7 +223,7 @@ class MemoryFile:
             file.write(content)
 
     def _remove(self) -> None:
-        with contextlib.suppress(OSError):  # on a read-only disk
+        with contextlib.suppress(OSError):  # fails on a read-only disk
             self._path.unlink(missing_ok=True)
             self._is_removed, self._reported, self._kept_nothing = True, "", True
             with contextlib.suppress(RuntimeError):  # the loop has closed meanwhile

@@ -149,7 +149,7 @@ def _prepare(sock: socket.socket, *, shared: bool) -> None:
 
 def _make_room(sock: socket.socket, plain: int, forced: int, size: int) -> None:
     sock.setsockopt(socket.SOL_SOCKET, plain, size)
-    with contextlib.suppress(OSError):  # over the system's limit, for processes with CAP_NET_ADMIN
+    with contextlib.suppress(OSError):  # may exceed the system's limit; needs CAP_NET_ADMIN
         sock.setsockopt(socket.SOL_SOCKET, forced, size)
 
 
@@ -337,7 +337,7 @@ class Names:
         if peer is None:
             number = from_kernel(unpack_address(raw))
             peer = self.name(number)
-            # Not cached with a scope: the interface may have another index once plugged in again.
+            # Not cached with a scope: a replugged interface may have another index.
             if "%" not in number[0]:
                 if len(self._heard) >= ADDRESSES_MAX:
                     self._heard.clear()

@@ -287,7 +287,7 @@ class _Slider:
 
         @self._slider.on_update
         async def _(event: Any) -> None:
-            if event.client is None:  # a change made by the program itself
+            if event.client is None:  # the program itself made the change
                 return
             number, low, high = float(self._slider.value), self._slider.min, self._slider.max
             if low <= number <= high:
@@ -709,7 +709,7 @@ class _Handle:
             active_axes=(True, True, axes > 2),
             disable_rotations=True,
             depth_test=False,
-            visible=False,  # until a position is known
+            visible=False,  # hidden until a position is known
         )
 
         @self._handle.on_update

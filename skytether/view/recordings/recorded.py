@@ -71,9 +71,7 @@ class Recorded:
 
     @property
     def can_be_explained(self) -> bool:
-        """Whether the flight can be flown again. A flight over UDP needs both ends' packets for
-        this.
-        """
+        """Whether the flight can be flown again; over UDP only with the packets of both ends."""
         return not self.about.began or (ends.PART in self.parts and not self.scenario.keeps_apart)
 
     @property
