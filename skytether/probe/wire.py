@@ -11,7 +11,8 @@
 |      |         |          | padding                                             |
 
 HELLO and WELCOME have the types that a handshake of `shared.wire.handshake` may carry. The session
-id is nonce and cookie. A PROBE is padded to the requested size; its ANSWER is at most as long.
+id is the nonce, then the cookie. A PROBE is padded to the requested size; its ANSWER is at most as
+long.
 """
 
 from struct import Struct

@@ -46,7 +46,7 @@ class Quadrotor:
         rng: random generator of the gusts, for this vehicle only.
         position: initial position, at rest [m]; shape (3,).
         ground_m: altitude of the ground; None for no ground.
-        charge: charge of its battery, from 0 to 1; infinite for a battery that never discharges.
+        charge: charge of the battery, from 0 to 1; "endless" for a battery that never discharges.
         hovers: whether the quadrotor begins in hover; otherwise its rotors stand still.
     """
 

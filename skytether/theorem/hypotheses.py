@@ -3,12 +3,13 @@
 docs/together-proof.md has the theorem and its five conditions. This module checks them from the
 record of a flight, at each step of each vehicle: the vehicle's rows have its position and the
 motion in force, the server's rows have the motions. In flight the server checks the same
-conditions, but only knows what observations report.
+conditions, but from the vehicles' observations alone.
 
-A motion is recorded as its first state and the inputs of `control.horizon` steps. A motion may last
-up to 140 steps. Steps after the recorded ones are not checked, unless the motion has come to rest
-by then. With a horizon of 131 steps or more, everything is recorded. Clocks and their bounds are
-not recorded at each step; the server only counts violations.
+A motion is recorded as its first state and the inputs of `control.horizon` steps, which are
+extrapolated to the next multiple of 10 steps. A motion may last up to 140 steps, so with a horizon
+of 131 steps or more all steps are checked. Otherwise later steps are checked only if the motion has
+come to rest before them. Clocks and their bounds are not recorded at each step; the server only
+counts violations.
 """
 
 import math

@@ -2,8 +2,8 @@
 
 The time daemon sets that bound. chrony and ntpd include half of the round-trip time to their
 source, so their bound holds for any network delay. systemd-timesyncd reports an error of 0, which
-is not an estimate: the time then counts as unknown. Chrony without `rtcsync` leaves the clock
-marked as not synchronised, which also counts as unknown.
+is not an estimate: the time then counts as unknown. The time also counts as unknown if the clock is
+marked as not synchronised, as by chrony without `rtcsync`.
 """
 
 import ctypes

@@ -172,8 +172,9 @@ class Process:
             waiting_for: name of the peer whose datagrams the endpoint waits for, for the log.
             insecure: whether to run without keys at an address that other machines can reach.
             ready: called after all checks, before the first datagram is received.
-            on_signal: called with a signal's number, to pass it on to another program. That program
-                uses stdout: events go to stderr, the final counters only to the feed and the file.
+            on_signal: called with the number of a signal that is to be passed on to another
+                program. This program uses stdout: events go to stderr, the final counters to feed
+                and file only.
         """
         options, feed, journal = self.options, self.feed, self.journal
         endpoint = self._watched(endpoint, None if line is None else 1)  # socket 1 is the line

@@ -3,7 +3,7 @@
 Any website in the user's browser can make the browser connect to this machine. So a connection from
 this machine is not sufficient: the request must come from our page (`Origin`), loaded under a name
 that nobody else can point at this machine (`Host`). Otherwise any website could read the flight, or
-fly it. A visitor with the token needs no checks.
+change it. A visitor with the token needs no checks.
 """
 
 import hmac

@@ -1,9 +1,10 @@
 """Safe reading of MCAP files: sizes that a file claims are checked before memory is allocated.
 
-A file of a few kilobytes may claim to hold gigabytes, and the library `mcap` allocates them. So the
-library gets records that end within the file, and chunks whose size is known before they are
-decompressed. The file is read once, from its beginning, so that a file without an index, whose
-writer was killed, can be read as well. After a damaged record, reading continues at the next chunk.
+A file of a few kilobytes may claim to hold gigabytes, and the library `mcap` would allocate them.
+So this module passes only records that end within the file to the library, and only chunks whose
+size is known before they are decompressed. The file is read once, from its beginning, so that a
+file without an index, whose writer was killed, can be read as well. After a damaged record, reading
+continues at the next chunk.
 """
 
 import os

@@ -4,7 +4,7 @@
 
 Each process has recorded its own part, with its own scenario. A key's value is taken from the
 process that owns the key; keys that both ends use for prediction must be equal. Times are converted
-to the clock of the first client, by the difference of the times of day.
+to the clock of the first client, by the difference between the times of day.
 """
 
 from collections import Counter
