@@ -1,4 +1,4 @@
-"""Text forms in which a scenario writes the entries of a table, for messages and lists."""
+"""Notation of a table's entries in a scenario, with parameters and bounds, for messages."""
 
 import typing
 from typing import Annotated, Any, Literal
@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 from skytether.shared.scenario.registry import Entry, Parameter
 
 LOW, HIGH = {"ge": "<=", "gt": "<"}, {"le": "<=", "lt": "<"}
-"""Signs of lower and upper bounds of a number, by their names in msgspec.Meta."""
+"""Signs of lower and upper bounds of a number, by the bounds' names in msgspec.Meta."""
 FURTHER = {
     "multiple_of": "a multiple of",
     "pattern": "with the pattern",
@@ -17,7 +17,7 @@ FURTHER = {
 
 
 def form(name: str, entry: Entry) -> str:
-    """Text form in which a scenario writes an entry, with parameters and bounds, for messages."""
+    """Notation of an entry in a scenario, with its parameters and their bounds, for messages."""
     if not entry.parameters:
         return name
     shown = ", ".join(
@@ -32,7 +32,7 @@ def form(name: str, entry: Entry) -> str:
 
 
 def parameter_text(parameter: Parameter) -> str:
-    """Name of a parameter with its bounds."""
+    """Text of a parameter for messages: its name and bounds."""
     kind, bounds = bounds_of(parameter.type)
     if parameter.file or typing.get_origin(kind) is Literal:
         what = "a file" if parameter.file else " or ".join(typing.get_args(kind))

@@ -7,7 +7,7 @@ of the input. The cost of each step and the optimal input are
 
 so at each step the input moves from the previous one towards -K x by the share 1 - λ.
 
-K accounts for the model's gain. It needs no dead time: the feedback uses the state predicted for
+K accounts for the model's gain, but not for a dead time: the feedback uses the state predicted for
 the time when the next input takes effect (`shared.law.dead_time`).
 """
 
@@ -19,7 +19,7 @@ from skytether.shared.law.model import Array
 from skytether.shared.scenario.schema import Scenario
 
 ROUNDS = 10_000
-"""Largest number of iterations of the Riccati recursion, for weights with slow convergence."""
+"""Largest number of iterations of the Riccati recursion. It converges slowly for some weights."""
 
 
 def regulator(scenario: Scenario) -> Array:
@@ -41,8 +41,8 @@ def converged_gain(
     input_weight: float,
     change_weight: float,
 ) -> Array:
-    """Gain on position, velocity and previous input; shape (axes, 3). It follows from A and B of
-    eq. (4), Q, R and S.
+    """Gain on position, velocity and previous input, computed from A and B of eq. (4), Q, R and S;
+    shape (axes, 3).
 
     The result is cached, because all vehicles of a scenario have the same gain.
     """

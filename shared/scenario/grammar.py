@@ -4,9 +4,9 @@
     call     := name | name(argument, …)
     argument := value | key=value
 
-`&` binds tighter than `|`. A value is a number or a word, such as a file name; in quotes it may
-have any character except a quote. Impairments, zones and goals are calls joined by `&` only. The
-tables in `shared.scenario.registry` list the names.
+`&` binds tighter than `|`. A value is a number or a word, such as a file name; a value in quotes
+may have any character except a quote. Impairments, zones and goals are calls joined by `&` only.
+The tables in `shared.scenario.registry` list the names.
 """
 
 import ast
@@ -16,9 +16,9 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 TEXT_MAX = 200
-"""Largest number of characters of a trigger, report, shape, scheme or vehicle."""
+"""Largest number of characters in the text of a trigger, report, shape, scheme or vehicle."""
 CALLS_MAX, NESTED_MAX = 100, 100
-"""Largest number of calls that are combined, and of opening parentheses between them."""
+"""Largest number of calls in a text, and of opening parentheses that are not part of a call."""
 
 Value = float | str
 
@@ -80,8 +80,8 @@ def parse(text: str, form: str) -> Expression:
     found, between = _calls(text, form)
     if len(found) > CALLS_MAX or between.count("(") > NESTED_MAX:
         raise GrammarError(text, form)
-    # Python's grammar has the same operators with the same precedence. `between` contains only
-    # operators and parentheses of the text.
+    # Python parses `between`, which has only operators, parentheses and a name for each call: its
+    # operators & and | have the same precedence as ours.
     rest = iter(found)
 
     def expression(node: ast.expr) -> Expression:

@@ -1,4 +1,4 @@
-"""Contradictions of a scenario whose scheme sends horizons of inputs."""
+"""Checks a scenario whose scheme sends horizons of inputs for contradictions."""
 
 import math
 from collections.abc import Iterator
@@ -10,11 +10,11 @@ from skytether.shared.wire.protocol import INPUTS_MAX
 TINY = 1e-9
 """Rounding tolerance of a product such as 40 · 0.011."""
 LOSSY = 0.3
-"""Share of lost packets on the uplink; if more are lost, horizons must be longer."""
+"""Loss ratio of the uplink above which horizons must be longer."""
 
 
 def ahead_s(scenario: Scenario) -> float:
-    """Time until a plan is in force [s]: the mean uplink delay or, if longer, the delay bound."""
+    """Time until a new plan is in force [s]: the larger of mean uplink delay and delay bound."""
     control, mean_s = scenario.control, scenario.uplink.mean_s
     if control.properties.flown_as in COMMITTING and control.delay_bound != "auto":
         return max(control.delay_bound, mean_s)
@@ -22,7 +22,7 @@ def ahead_s(scenario: Scenario) -> float:
 
 
 def too_late(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of horizons that are too short for the network's delays or losses."""
+    """Contradictions of a scenario with horizons too short for the network's delays or losses."""
     yield from _too_slow(scenario)
     if scenario.control.properties.flown_as in INDEXED and scenario.vehicle.exhausted == "brake":
         yield from _too_short(scenario)
@@ -31,7 +31,7 @@ def too_late(scenario: Scenario) -> Iterator[Contradiction]:
 def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
     control, axes = scenario.control, scenario.model.axes
     up, down = scenario.uplink, scenario.downlink
-    # Delay that the server estimates: its clock map takes half of the smallest round trip.
+    # The server's estimate of the delay: its clock map takes half of the smallest round trip.
     delay_s = up.mean_s - up.least_s + (up.least_s + down.least_s) / 2
     seen = f"the delay of {delay_s:g} s (half of the smallest round trip, and the uplink's jitter)"
     H, dt, bound_s = control.horizon, control.dt, control.delay_bound
@@ -50,7 +50,7 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradiction of a horizon that is too short for the vehicle to brake."""
+    """Contradiction of a scenario with a horizon in which the vehicle cannot brake to rest."""
     control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
     covered_s, lossy = control.horizon * control.dt, scenario.uplink.loss > LOSSY
     least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)

@@ -1,10 +1,10 @@
-"""Owners of a scenario's keys, as metadata in the type of each key.
+"""Owners of a scenario's keys, stored as metadata in the type of each key.
 
     dt: Annotated[float, Meta(ge=0.001, le=1), Key(Owner.BOTH, term="dt_ns")] = 0.05
     observer_s: OfServer[Duration] = 4.0
 
-msgspec and tyro ignore this metadata. `catalogue.py` collects it, for the keys of the terms and the
-keys that may change in flight.
+msgspec and tyro ignore this metadata. `catalogue.py` reads from it which keys are terms of the
+flight, and which keys may change in flight.
 """
 
 from enum import Enum, StrEnum, auto
@@ -17,7 +17,7 @@ class Owner(Enum):
     """Owner of a key: which end uses its value, and whether the ends may have different values."""
 
     BOTH = "both ends"
-    """A term of the flight: both ends predict with it, so its value must be equal at both."""
+    """A term of the flight: both ends predict with it, so both must have the same value."""
     EACH = "each end"
     """Key that each end reads from its own scenario."""
     SERVER = "server"
@@ -28,7 +28,7 @@ class Owner(Enum):
 
 
 class InFlight(StrEnum):
-    """Groups of keys that change together in flight; missions and others add further groups."""
+    """Groups of keys that change together in flight; optional packages add further groups."""
 
     TRIGGER = auto()
     POINT = auto()
@@ -43,7 +43,7 @@ class InFlight(StrEnum):
 class Key(msgspec.Struct, frozen=True):
     owner: Owner
     in_flight: str = ""
-    """Group with which the key may change in flight; empty if it may not change."""
+    """Group of keys with which this key may change in flight; empty if this key may not change."""
     term: str = ""
     """Field of `Terms` for a key of both ends; empty if the field has the key's name."""
     is_decision: bool = False

@@ -22,16 +22,16 @@ class TooFast(NamedTuple):
     """First step at which a desired trajectory is faster than the vehicle can fly."""
 
     at_s: float
-    """Time in the flight [s]."""
+    """Time of the step, from the flight's start [s]."""
     speed_mps: float
-    """Desired speed along the axis with the largest excess [m/s]."""
+    """Desired speed on the axis on which the vehicle's largest speed is exceeded most [m/s]."""
     most_mps: float
-    """Largest speed of the vehicle along the axis with the largest excess [m/s]."""
+    """Largest speed of the vehicle on the axis of `speed_mps` [m/s]."""
 
 
 def is_known(scenario: Scenario) -> bool:
-    """Whether the desired trajectory is known before the flight. Those of a live point, of a target
-    and of a mission are unknown.
+    """Whether the desired trajectory is known before the flight. It is unknown for a live point, a
+    target and a mission.
     """
     return scenario.reference.shape not in ("live", "target") and not scenario.keeps_apart
 
@@ -46,7 +46,7 @@ def excess(scenario: Scenario, velocity: Array) -> Array:
 
 
 def is_too_fast(scenario: Scenario, velocity: Array) -> Flags:
-    """Whether a desired velocity is more than the vehicle's largest on any axis; shape (n,)."""
+    """Whether a desired velocity exceeds the vehicle's largest speed on any axis; shape (n,)."""
     over: Flags = np.any(excess(scenario, velocity) > 1.0 + TINY, axis=1)
     return over
 

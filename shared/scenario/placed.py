@@ -1,4 +1,4 @@
-"""Contradictions of shapes that are given by points, by a file, or by goals."""
+"""Checks shapes that are given by points, by a file, or by goals for contradictions."""
 
 from collections.abc import Iterator
 from itertools import pairwise

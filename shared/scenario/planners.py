@@ -13,11 +13,11 @@ from skytether.shared.scenario.schema import Scenario
 
 planner = PLANNERS
 """Decorator of a planner: a class with the method `plan`, see `Planner`. Its constructor takes a
-`Problem` and the planner's own numbers."""
+`Problem`, and the numbers in brackets after the planner's name."""
 
 
 class Problem(NamedTuple):
-    """Problem of one vehicle, from which a planner is made."""
+    """Planning problem of one vehicle, passed to the planner's constructor."""
 
     model: Model
     """Model of the vehicle: `model.step(x, u)` is the state one step later, `model.roll(x, inputs)`
@@ -40,7 +40,7 @@ class Problem(NamedTuple):
 
 
 def _read_only(array: Array) -> Array:
-    """Read-only copy, so that no planner can change the data of others."""
+    """Read-only copy of an array, so that no planner can change data that others use."""
     copy = array.copy()
     copy.setflags(write=False)
     return copy
@@ -52,7 +52,8 @@ class Planner(Protocol):
     def plan(self, state: Array, reference: Array, previous: Array) -> Array:
         """Plan of the next H steps.
 
-        The model needs no wind: an estimated disturbance is subtracted from the inputs afterwards.
+        A planner may ignore wind: the estimated disturbance is subtracted from its inputs
+        afterwards.
 
         Args:
             state: predicted state of the vehicle at the start of the plan [m, m/s]; shape (axes,
@@ -60,7 +61,7 @@ class Planner(Protocol):
             reference: desired states from the start of the plan on, extrapolated where unknown
                 [m, m/s]; shape (H + 1, axes, 2).
             previous: inputs of the vehicle's previous plan from the start of this plan on, the last
-                one repeated [m/s]; 0 if there is no previous plan; shape (axes, H).
+                input repeated [m/s]; 0 if there is no previous plan; shape (axes, H).
 
         Returns:
             inputs [m/s], shape (axes, H), which are limited to ±u_max; or, with the scheme

@@ -1,8 +1,9 @@
 """Reading a scenario from a TOML file, with the scenarios it extends and the files it names.
 
-A scenario with `extends = "other"` (name of a built-in scenario, or a file beside it) contains only
-the differences from the other. Every value is checked here, and every file that a scenario names is
-read here, so that endpoints open no files. `skytether list scenarios` lists the built-in scenarios.
+A scenario with `extends = "other"` (name of a built-in scenario, or of a file in the same folder)
+contains only its differences from that scenario. Every value is checked here, and every file that a
+scenario names is read here, so that endpoints open no files. `skytether list scenarios` lists the
+built-in scenarios.
 """
 
 import math
@@ -27,7 +28,7 @@ from skytether.shared.scenario.whole import Scenario, WithFiles
 
 SCENARIOS = Path(scenarios.__file__).parent
 EXTENDS_MAX = 20
-"""Largest length of a chain of `extends`."""
+"""Largest number of scenarios that extend each other in a chain."""
 FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
     {
         "network.uplink": (IMPAIRMENTS, 128 * 1024 * 1024),
@@ -35,9 +36,10 @@ FILES: Mapping[str, tuple[PluginTable, int]] = MappingProxyType(
         **rooms.FILES,
     }
 )
-"""Keys whose text may name files: table of the text's entries, and largest size of a file [B]."""
+"""Keys whose text may name files, each with the table of entries allowed in the text, and the
+largest size of a file [B]."""
 TABLE_BYTES_MAX, LOG_BYTES_MAX = 16_000_000, 64_000_000
-"""Largest sizes of `reference.file` [B]: of a table, and of an autopilot's log."""
+"""Largest size of `reference.file` [B] if it is a table, and if it is an autopilot's log."""
 LOGS = (".ulg", ".bin")
 WAYS = ("uplink", "downlink")
 COMPARED = "compare"
@@ -94,9 +96,9 @@ def check(
 
     Args:
         raw: the table.
-        source: file or command line of the values, for messages.
-        checked: a scenario that was checked before; if its desired trajectory is the same, files
-            are not read again.
+        source: origin of the values, a file or the command line, for messages.
+        checked: a scenario that was checked before; if the new scenario has the same desired
+            trajectory, files are not read again.
         any_network: whether a network too slow or too lossy for a flight is allowed.
 
     Raises:
@@ -149,7 +151,7 @@ def _where(source: str) -> str:
 
 
 def to_table(scenario: schema.Scenario) -> dict[str, Any]:
-    """Plain values of a scenario, from which `check` makes it again."""
+    """Plain values of a scenario, from which `check` makes an equal scenario."""
     return {
         name: msgspec.to_builtins(getattr(scenario, name)) for name in Scenario.__struct_fields__
     }
@@ -164,7 +166,8 @@ def _read(name: str, seen: Mapping[tuple[Path, str], str] = MappingProxyType({})
 
     Args:
         name: name or path of the scenario.
-        seen: scenarios that extend this one, directly or indirectly; it must not extend them.
+        seen: scenarios that extend this one, directly or indirectly; this scenario must extend none
+            of them.
     """
     file, _, entry = name.rpartition("/")
     if name.endswith(".toml") or name in names():
@@ -232,7 +235,7 @@ def _with_files(scenario: Scenario, source: str, checked: schema.Scenario | None
 
 
 def _naming_files(scenario: schema.Scenario) -> list[tuple[str, str]]:
-    """Keys whose values may name files, with their values; a network's keys for each path."""
+    """Keys whose values may name files, with the values; network keys once for each path."""
     return [
         ("reference.file", scenario.reference.file),
         *((f"network.{way}", getattr(path, way)) for path in scenario.paths for way in WAYS),
@@ -252,7 +255,7 @@ def files_of(key: str, text: str, source: str = "", have: Files = ()) -> Files:
     Args:
         key: `reference.file`, or one of FILES.
         text: value of the key.
-        source: file or command line of the value, for messages.
+        source: origin of the value, a file or the command line, for messages.
         have: files read before.
 
     Raises:
@@ -282,8 +285,8 @@ def _content(where: str, name: str, most: int) -> bytes:
 
 
 def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Raw table in which arguments given as keys, such as `network.uplink.loss`, replace those in
-    the default texts.
+    """Raw table in which arguments given as keys, such as `network.uplink.loss`, replace the
+    arguments in the default texts.
     """
     default = to_table(Scenario())
     for key in rooms.TEXTS:
@@ -296,7 +299,7 @@ def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _with_paths(raw: dict[str, Any], source: str) -> dict[str, Any]:
-    """Raw table in which every path has both directions; the network's are the default."""
+    """Raw table in which every path has both directions, if necessary those of the network."""
     network: Any = raw.get("network")
     paths = network.get("paths") if isinstance(network, Mapping) else None
     if not (isinstance(paths, list | tuple) and all(isinstance(each, Mapping) for each in paths)):
@@ -323,7 +326,7 @@ def _path(file: str) -> Path:
         return SCENARIOS / f"{file}.toml"
     try:
         return Path(file).resolve()
-    except (ValueError, OSError, RuntimeError) as error:  # such as a NUL, or a cycle of links
+    except (ValueError, OSError, RuntimeError) as error:  # a NUL in the name, or a cycle of links
         raise ConfigError(f"{file}: cannot be read: {error}") from None
 
 
@@ -339,8 +342,8 @@ def read_toml(path: Path, file: str) -> dict[str, Any]:
 def _overlay(
     below: dict[str, Any], above: dict[str, Any], source: str, prefix: str = ""
 ) -> dict[str, Any]:
-    """Merge two raw tables. Values in `above` take precedence; an argument that `above` has as a
-    key changes the text.
+    """Merge two raw tables. Values in `above` take precedence; an argument that `above` sets by a
+    key replaces the argument in the text.
     """
     merged = dict(below)
     for name, value in above.items():

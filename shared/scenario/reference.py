@@ -1,4 +1,5 @@
-"""Desired trajectories x_d(t): position and velocity at any time (E6: the paper has positions).
+"""Desired trajectories x_d(t): position and velocity at any time (E6 in docs/paper.md: the paper
+has positions only).
 
 A reference is a function from time since the epoch [s; any shape] to the desired state
 [m, m/s; that shape + (axes, 2)], in the world frame with the third axis up.
@@ -21,13 +22,14 @@ FAST_MPS = 1e6
 """Largest velocity along an axis of a trajectory made from points [m/s]."""
 SAMPLED_S = np.concatenate([0.2347 * np.arange(512), np.geomspace(121.0, 86_400.0, 64)])
 """Times at which a plug-in's trajectory is checked before a flight [s]: dense for two minutes, then
-increasingly sparse up to a day. They are not round numbers: a trajectory may have corners there."""
+increasingly sparse up to a day. They are not round numbers, because many trajectories have corners
+at round times."""
 
 Reference = Callable[[NDArray[Any]], Array]
 
 
 class OfFleet(ABC):
-    """Desired trajectories of several vehicles; a call returns one vehicle's, as a `Reference`."""
+    """Desired trajectories of several vehicles. An object is the `Reference` of one of them."""
 
     @property
     @abstractmethod

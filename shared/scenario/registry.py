@@ -41,7 +41,8 @@ UNITS: Mapping[str, Mapping[str, tuple[float, float]]] = MappingProxyType(
         "": {"%": (1.0, 100.0)},
     }
 )
-"""Units allowed after a number: multiplier and divisor, by the end of the parameter's name."""
+"""Units allowed after a number, by the ending of the parameter's name. Each unit has a multiplier
+and a divisor."""
 
 _NAME = re.compile(r"[a-z_]\w*(-\w+)*", re.ASCII | re.IGNORECASE)
 _WITH_UNIT = re.compile(rf"({grammar.NUMBER.pattern})([a-z]+|%)", re.ASCII | re.IGNORECASE)
@@ -89,7 +90,7 @@ class Parameter:
         return isinstance(value, str) or math.isfinite(value)
 
     def without_unit(self, value: Value | None) -> Value | None:
-        """A number in the parameter's own unit, from a word such as 50ms, 10% or 1mbit."""
+        """Number in the parameter's own unit for a word such as 50ms; for all else the value."""
         match = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
         units = next(units for end, units in UNITS.items() if self.name.endswith(end))
         if match is None or match[2].lower() not in units:
@@ -174,7 +175,7 @@ _OFFERED = Entry(_offered, (), "")
 class PluginTable(dict[str, Entry]):
     """Entries of one kind by name. The table is also the decorator that adds an entry.
 
-    Methods with a text of entries raise GrammarError if a part of it is invalid.
+    Methods that take a text of entries raise GrammarError if the text is invalid.
 
     Args:
         kind: noun for an entry, for messages.
@@ -289,7 +290,7 @@ class PluginTable(dict[str, Entry]):
         return [(each, parameters[min(i, last)].file) for i, each in enumerate(call.values)]
 
     def with_values(self, text: str, call: Call, values: Sequence[Any]) -> str:
-        """Copy of `text` in which `values` replace the arguments of the call."""
+        """Copy of `text`, a text of entries, in which `values` replace the arguments of `call`."""
         files = [file for _, file in self._args(call)]
         shown = [
             f'"{value}"' if file else value if isinstance(value, str) else repr(value)
@@ -322,7 +323,7 @@ class PluginTable(dict[str, Entry]):
         return add(make) if make else add
 
     def add(self, make: Callable[..., Any], name: str, needs: str = "") -> None:
-        """Add an entry; it replaces one with the same name from the same module.
+        """Add an entry; an entry of the same name and module is replaced.
 
         Raises:
             ConfigError: see `__call__`.

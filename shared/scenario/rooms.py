@@ -1,6 +1,7 @@
 """Entries, keys and sections of scenarios, and the modules that define them.
 
-Help texts and documents have the same order. The modules are imported when they are used.
+Help texts and documents list sections in the order of this module. The modules are imported when
+they are used.
 """
 
 from collections.abc import Mapping
@@ -46,7 +47,8 @@ SECTIONS = {
     "mavlink": "skytether.client.mavlink.keys",
     "ros2": "skytether.client.ros2.keys",
 }
-"""Module of each optional section, or of optional keys of a section; its SECTION is the class."""
+"""Module of each optional section, or of the optional keys of a section. `SECTION` in the module is
+the section's class."""
 
 FILES = {"mission.zones": (ZONES, 4_000_000)}
 """Keys of optional sections whose text may name files, see `reading.FILES`."""
@@ -61,7 +63,7 @@ TEXTS: Mapping[str, PluginTable] = MappingProxyType(
         "network.downlink": IMPAIRMENTS,
     }
 )
-"""Keys whose value is a text with arguments; by key, the table of the entries in the text."""
+"""For each key whose value is a text with arguments, the table of the entries in the text."""
 EVENTS = (
     f"{SHARED}events.aboard",
     f"{SHARED}events.ground",

@@ -1,13 +1,13 @@
 """Keys of a scenario: everything about a flight, typed and frozen.
 
-A key is defined here, or in the module `keys` of the optional package with its section
-(`rooms.SECTIONS`; `whole.Scenario` has all of them), and nowhere else: name, owner (`owners.py`),
-type with bounds, default, and a description with its unit in brackets. The description appears in
-`--help` and in docs/keys.md, which `make keys` writes. A `Term` is used by both ends: it has a
-field in `shared/law/terms.py: Terms`, which `Scenario.terms` fills in.
+This module defines the keys of the core. An optional package defines the keys of its section in its
+module `keys` (`rooms.SECTIONS`); `whole.Scenario` has all sections. A definition consists of name,
+owner (`owners.py`), type with bounds, default, and a description with the unit in brackets. The
+description appears in `--help` and in docs/keys.md, which `make keys` writes. Both ends use a
+`Term`: `Scenario.terms` copies it to a field of `shared/law/terms.py: Terms`.
 
-`reading.py` reads a scenario from its TOML file, and `contradictions.py` finds values that are each
-valid, but not together.
+`reading.py` reads a scenario from its TOML file, and `contradictions.py` finds values that are
+valid alone, but not together.
 """
 
 import hashlib
@@ -76,7 +76,7 @@ SHAPE_CHARS = 15
 
 
 Contradiction = tuple[str, object, str]
-"""Key, its given value, and the expected value in words."""
+"""Contradiction: a key, its given value, and the expected value in words."""
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -273,7 +273,7 @@ class VehicleConfig(Section, frozen=True):
     """Frame of a quadrotor, see docs/vehicles.md; auto: 1.5kg, or that of the autopilot's
     simulator."""
     battery: OfVehicle[Annotated[float, Meta(ge=0, le=1)] | Literal["endless"]] = 1.0
-    """Charge of a quadrotor's battery at the start; endless: always full."""
+    """Charge of a quadrotor's battery at the start, from 0 to 1; endless: always full."""
 
 
 class SensorConfig(Section, frozen=True):
@@ -290,9 +290,9 @@ class SensorConfig(Section, frozen=True):
     velocity_bias_mps: OfVehicle[tuple[Speed, ...]] = ()
     """Constant error of velocities, on each axis [m/s]."""
     position_every_s: OfVehicle[Duration] = 0.0
-    """Time between two measured positions [s]; 0: one at every step."""
+    """Time between two measured positions [s]; 0: measured at every step."""
     velocity_every_s: OfVehicle[Duration | Literal["never"]] = 0.0
-    """Time between two measured velocities [s]; 0: one at every step."""
+    """Time between two measured velocities [s]; 0: measured at every step."""
     delay_s: OfVehicle[Annotated[float, Meta(ge=0, le=2)]] = 0.0
     """Delay of the measurements [s]."""
     process_noise: OfVehicle[Factor] = 0.1
@@ -333,14 +333,14 @@ class LinkConfig(Section, frozen=True):
     """Largest age of the observation from which an input was computed [s]; after that the vehicle
     acts as at the end of a horizon (`vehicle.exhausted`)."""
     join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
-    """Time after its first knot for which the vehicle accepts a trajectory [s]; 0: always. With a
-    limit the server knows which trajectory the vehicle flies."""
+    """Time after a trajectory's first knot for which the vehicle accepts the trajectory [s]; 0:
+    always. With a limit the server knows which trajectory the vehicle flies."""
     asymmetry_s: OfServer[Annotated[float, Meta(ge=0, le=10)]] = 0.0
-    """Largest difference between the smallest delays of uplink and downlink over 20 s [s]; 0:
-    unknown. The value bounds the error of the vehicle's clock."""
+    """Upper bound of the difference between the smallest delay of the uplink and that of the
+    downlink, each over 20 s [s]; 0: unknown. The value bounds the error of the vehicle's clock."""
     time_of_day: OfEach[Literal["none", "host"]] = "none"
-    """Source of the time of day on a mission; if both ends have a source, clocks are compared.
-    host: the host's clock, with an error bound from its kernel (chrony)."""
+    """Source of the time of day on a mission; if both ends have a source, the two clocks are
+    compared. host: the host's clock, with an error bound from its kernel (chrony)."""
     timeout_s: OfEach[Interval] = 1.5
     """Silence after which the vehicle brakes and asks for a new session [s]. The server frees the
     vehicle's number after the same time, or twice this time with heartbeats "auto"."""
@@ -439,7 +439,8 @@ class Scenario(Section, frozen=True):
         """Scenario with one path only. Each path except the first has a derived seed.
 
         Args:
-            index: number of the path, from 0; for a standby server's network, the number of paths.
+            index: number of the path, from 0. The number of paths stands for the network of a
+                standby server.
         """
         path = (*self.paths, self.paths[0])[index]
         network = msgspec.structs.replace(
@@ -537,7 +538,7 @@ class Scenario(Section, frozen=True):
         )
 
     def make_reference(self, vehicle: int = 1) -> shapes.Reference:
-        """Desired trajectory of a vehicle, by its number; each vehicle has its own "target"."""
+        """Desired trajectory of the vehicle with this number; each vehicle has its own "target"."""
         reference = self.unallocated_reference(vehicle)
         for section in self.sections():
             reference = section.assigned(reference, vehicle)
@@ -583,7 +584,9 @@ class Scenario(Section, frozen=True):
         return digest(self.table + repr(origin).encode() if self.table and origin else self.table)
 
     def _shape(self) -> str:
-        """Shape as a term: the shape's name; of a plug-in, text and a digest of the states."""
+        """Shape as a term of the flight: the shape's name; for a plug-in's shape, its text and a
+        digest of its states.
+        """
         shape = REFERENCES.one(self.reference.shape)
         if REFERENCES[shape.name].is_ours:
             return shape.name

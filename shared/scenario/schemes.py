@@ -1,7 +1,7 @@
 """Table of the schemes of delay compensation, with their properties.
 
 The code of a built-in scheme is the module of its name in `server.schemes`. A plug-in's scheme is a
-class that extends one of `skytether.plugin_scheme` and has `properties`.
+class that extends a class of `skytether.plugin_scheme` and has `properties`.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ class SchemeProperties(NamedTuple):
     """Properties of a scheme that other modules depend on."""
 
     flown_as: str = "predictive"
-    """Name of the built-in scheme by which the vehicle flies this scheme's messages, one of
+    """Built-in scheme with which the vehicle flies the plans of this scheme, one of
     `shared.law.terms.FLOWN_AS`."""
     figures: tuple[str, ...] = ()
     """Figures of a plan that the scheme computes, from FIGURES."""

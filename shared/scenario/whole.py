@@ -1,4 +1,4 @@
-"""Scenario with all installed optional sections (types: `whole.pyi`)."""
+"""Scenario with all installed optional sections. Its types are in `whole.pyi`."""
 
 import msgspec
 

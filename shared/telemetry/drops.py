@@ -11,7 +11,7 @@ import msgspec
 
 
 class DirectionCounts(msgspec.Struct, frozen=True):
-    """Packets that netem did not forward in one direction, see `netem.link.Counts`."""
+    """Numbers of packets that netem did not forward in one direction, see `netem.link.Counts`."""
 
     undelivered: int = 0
     lost: int = 0
@@ -54,8 +54,8 @@ def drops(
     """Number of packets that each process dropped, by reason; only reasons that occurred.
 
     Args:
-        figures: figures of each process, by its name. The figures of a server's workers are added
-            up, and those of the netems of several paths.
+        figures: figures of each process, by its name. Figures of a server's workers are added up,
+            as are figures of the netems of several paths.
         vehicle: number of the vehicle to count in a client; None: all of its vehicles.
     """
     totals: dict[str, Counter[str]] = {}

@@ -27,7 +27,7 @@ def kinds(base: type[Event] = Event) -> Iterator[type[Event]]:
             yield kind
 
 
-# The search for classes replaces a list of them. For mypy the union is `Event`.
+# The classes are found by a search, so that no list has to be kept. For mypy the union is `Event`.
 if TYPE_CHECKING:
     EveryEvent = Event
 else:

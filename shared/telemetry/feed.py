@@ -36,8 +36,8 @@ class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=
     scenario: str
     """The scenario as TOML, with all changes in flight so far."""
     parts: dict[str, str]
-    """Columns of each part of the record in this feed, by the part's name: numpy's description as
-    JSON."""
+    """Columns of each part of the record in this feed, as numpy's description in JSON, by the
+    part's name."""
     directions: Directions = msgspec.field(name="ways", default=FLIGHT)
     """Names of both directions of the process's network."""
     wall_ns: int

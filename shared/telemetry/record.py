@@ -29,7 +29,7 @@ RECORDING = ".mcap"
 
 
 class Reason(IntEnum):
-    """Why a vehicle is in its mode, see `client.failsafe`."""
+    """Reason why a vehicle is in its mode, see `client.failsafe`."""
 
     def __new__(cls, number: int, text: str = "") -> "Reason":
         made = int.__new__(cls, number)
@@ -174,7 +174,7 @@ PACKET_COLUMNS: np.dtype[np.void] = np.dtype(
         ("number", "<u4"),  # number of the packet in its flow and direction
         ("bytes", "<u2"),  # size of the UDP payload; with `netem run`, of the IP packet
         ("arrived_ns", "<i8"),  # time of arrival at netem [netem's clock]
-        ("delay_ns", "<i8"),  # drawn delay; a lost packet has one, too
+        ("delay_ns", "<i8"),  # drawn delay, also of a lost packet
         ("lost", "?"),
         ("overtaken", "?"),  # whether a later packet of the flow left earlier
     ]
@@ -285,8 +285,8 @@ class Record:
     failure: Failure | None = None
     """Event that ended the flight of a vehicle; the first one if there are several."""
     figures: Mapping[str, Any] = field(default_factory=dict)
-    """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); in a batch, those at
-    the end of the batch."""
+    """Figures of the endpoints "server" and "netem" (see `Endpoint.figures`); in a batch, their
+    figures at the end of the batch."""
     events: tuple[FlightEvent, ...] = ()
     """Events of the run's own endpoints, and the server's events about its vehicles, in order."""
     incomplete: tuple[RecordIncomplete, ...] = ()

@@ -13,7 +13,8 @@ from skytether.shared.telemetry.record import UPLINK, Record, Rows
 CLIENT = re.compile(r"client \d+\.(\d+)")
 """Name of a client's host in virtual time: seed and vehicle; over UDP a host has an address."""
 PACKETS, PLANS = 400, 50
-"""Numbers of first packets and first plans of a vehicle from which `begin_ns` finds tick 0."""
+"""Largest number of a vehicle's packets, and of its plans, that `begin_ns` compares to find tick 0.
+Both are counted from the first."""
 
 
 def ticks(server: Rows) -> Indices:
@@ -29,15 +30,15 @@ def ticks(server: Rows) -> Indices:
 
 
 def flows(record: Record) -> dict[int, int]:
-    """Vehicle of each flow; empty for flights over UDP, whose records do not name it."""
+    """Vehicle of each flow; empty for flights over UDP, whose records do not name the vehicles."""
     opened = [each.event for each in record.events if isinstance(each.event, FlowOpened)]
     named = [(each.flow, CLIENT.fullmatch(each.host)) for each in opened]
     return {flow: int(client[1]) for flow, client in named if client}
 
 
 def begin_ns(record: Record, dt_ns: int) -> int | None:
-    """Time at which the packets of tick 0 leave, in virtual time [ns]. The result is the time at
-    which most plans coincide with a packet, to a millisecond; None if no plan does.
+    """Time at which the packets of tick 0 leave, in virtual time [ns]: the time for which most
+    plans leave within a millisecond of a packet. None if no plan does.
     """
     own, server = flows(record), record.server
     sent, times = server[server["event"]], Counter[int]()
@@ -54,7 +55,7 @@ def begin_ns(record: Record, dt_ns: int) -> int | None:
 
 
 def are_plans(record: Record, packets: Rows, dt_ns: int) -> Flags:
-    """Whether each packet has a plan: it leaves at a tick at which the server sends a plan."""
+    """Whether each packet has a plan: it left at a tick at which the server sent a plan."""
     began_ns, own = begin_ns(record, dt_ns), flows(record)
     if began_ns is None:
         return np.zeros(len(packets), dtype=np.bool_)

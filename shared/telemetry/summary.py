@@ -45,8 +45,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     error_max: float | None
     """Largest distance from the desired trajectory, from `settle` on [m]."""
     covered: float | None
-    """Share of the steps with a planned input; in the others the vehicle hovered, braked, or held
-    the last input."""
+    """Share of the steps with a planned input; in the other steps the vehicle hovered, braked, or
+    held the last input."""
     modes: dict[str, float]
     """Time in each mode that occurred [s], see `shared.wire.protocol.Mode`."""
     mode: str | None
@@ -93,8 +93,8 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     server and netem count the packets of all vehicles. None without the figures of the
     processes."""
     plugin_errors: dict[str, int] | None = None
-    """Number of failures of a plug-in's code at the server, by its kind; for all vehicles. None
-    without the figures of the processes."""
+    """Number of failures of a plug-in's code at the server, by kind of plug-in, for all vehicles
+    together. None without the figures of the processes."""
     age_ms_p50: float | None
     """Median over all steps of the age of the observation behind the flown input [ms]."""
     age_ms_p99: float | None
@@ -236,7 +236,7 @@ def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Arr
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
     Only the server's record has the position of a live point and the goal of a vehicle on a
-    mission. A step without a row there gets the value of the previous row. NaN: unknown.
+    mission. A step without a row of the server gets the value of the previous row. NaN: unknown.
 
     Args:
         client: rows of the vehicle.
@@ -272,7 +272,8 @@ def position_error(scenario: Scenario, client: Rows, server: Rows | None = None)
 def _estimate_error(scenario: Scenario, client: Rows) -> Array:
     """Error of the position used by feedback [m]; shape (steps, axes).
 
-    With a dead time, the true position is taken one dead time later; NaN after the flight's end.
+    With a dead time, feedback uses the position predicted for one dead time later, so the true
+    position is taken at that time. NaN: that time is after the flight's end.
     """
     flown_by: Array = client["estimate"][..., 0]
     true = client["state"][..., 0]
@@ -360,7 +361,7 @@ def separations(
         height_scale: factor of distances along the third axis, see `MissionConfig`.
 
     Returns:
-        times on that clock [s; shape (n,)], empty for fewer than two vehicles, and distances
+        times on the common clock [s; shape (n,)], empty for fewer than two vehicles, and distances
             [m], NaN while fewer than two fly.
     """
     tracks = [

@@ -1,4 +1,4 @@
-"""Reasons for dropping a datagram, and the error that has such a reason.
+"""Reasons for dropping a datagram, and the error that contains the reason.
 
 A dropped datagram is an error of the peer or the network. Dropped datagrams are counted by reason
 and never answered. Message codec (`protocol`), encryption (`channel`, `handshake`) and both ends

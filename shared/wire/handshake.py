@@ -9,7 +9,7 @@
 
 The header is version u8, type u8, vehicle u16 and the number of the vehicle's key u8. The MAC is a
 keyed BLAKE2s over everything before the MAC; in an answer also over the client's ephemeral key. So
-a packet of another peer, or for another attempt, is dropped before any costly computation. The
+a packet from another peer, or for another attempt, is dropped before any costly computation. The
 HELLO in message 1 is padded, so that no answer is longer than its request.
 """
 

@@ -35,7 +35,7 @@ from skytether.shared.wire.protocol import (
 )
 
 PLANS = {number_of(plan): len(plan._fields) + 3 for plan in (Horizon, Trajectory)}
-"""Number of elements of an encoded plan with a leadership, by the type number of the plan."""
+"""Number of elements of an encoded plan with a leadership number, by the type of the plan."""
 
 
 class Lead(NamedTuple):
@@ -46,14 +46,14 @@ class Lead(NamedTuple):
     vehicle: int
     session: int
     number: int
-    """Leadership number. It only rises, and plans with another leadership number are not flown."""
+    """Leadership number. It only rises; the vehicle does not fly plans with another number."""
     leads: int
     """1 if the server of this session leads the vehicle, else 0."""
     largest: int = 0
     """Largest leadership number that the server has received; 0 from a vehicle."""
     step: int = 0
-    """From a vehicle, its step k at which it sends; from a server, the step in the vehicle's newest
-    LEAD. A server leaves the next three fields empty."""
+    """In a vehicle's LEAD, the step k at which it was sent; in a server's LEAD, the step of the
+    vehicle's newest LEAD. A server leaves the next three fields empty."""
     in_force: int | None = None
     """Step for which the motion in force was made; None if no motion is in force."""
     spacing: int = 0

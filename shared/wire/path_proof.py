@@ -1,4 +1,4 @@
-"""PATH, the message that names and proves a session's paths.
+"""PATH, the message that names a session's paths and proves their addresses.
 
 `protocol` has the type number of PATH, and imports this module when such a message is sent or
 arrives. Processes in real time import this module before the first packet (`protocol.preload`).

@@ -83,7 +83,7 @@ dead, until the probability is at most DOUBT."""
 PATIENCE = 3
 """Largest factor on the interval between probes of a path that stays down."""
 ALIKE = 1.25
-"""Factor on the least expected cost; sets of paths with a cost up to this are used in turn."""
+"""Sets of paths with a cost up to this multiple of the least expected cost are used in turn."""
 ALIVE_WORTH = 40.0
 """Cost if the other end considers a working link lost, in packets of price 1."""
 _SETS = {
@@ -111,7 +111,7 @@ class _InFlight:
     sequence: int
     sent_ns: int
     is_lost: bool = False
-    """Whether the packet counts as lost; a late acknowledgement corrects that."""
+    """Whether the packet counts as lost, until a late acknowledgement shows that it arrived."""
 
 
 @dataclass(slots=True)
@@ -154,7 +154,8 @@ class PathState:
 
         Args:
             under_way: number of packets in flight.
-            is_sent: whether one more packet is sent now, when an outage may have ended.
+            is_sent: whether one more packet is sent now; an outage may have ended since the last
+                packet.
         """
         down, loss = self._down(now_ns), self.loss
         if is_sent and self.used_ns is not None:
@@ -177,7 +178,7 @@ class PathState:
 
     @property
     def quick_ns(self) -> int:
-        """Time after which a packet counts as lost if a report does not acknowledge it."""
+        """Time after which a packet counts as lost if no report acknowledges it [ns]."""
         if not self.delays_ns:
             return WAIT_NS
         return _within(min(self.delays_ns) * 3 // 2 + 2 * SPARE_NS)
@@ -207,7 +208,7 @@ class PathState:
                 self.in_flight.append(packet)
 
     def expire(self, silence_ns: int, now_ns: int) -> None:
-        """Count packets as lost if no report acknowledged them although one was due.
+        """Count packets as lost if no report acknowledged them although a report was due.
 
         Args:
             silence_ns: silence of the other end after which a report is due.
@@ -294,8 +295,8 @@ class Paths:
         return bytes((BIN8, len(head) + len(masks))) + head + masks
 
     def choose(self, worth: float, now_ns: int, among: Sequence[int]) -> tuple[int, ...]:
-        """Paths for the next message. If several sets of paths have about equal cost, the set that
-        was unused for longest.
+        """Paths for the next message. Of several sets of paths with about equal cost, the set that
+        was unused for longest is chosen.
 
         Args:
             worth: cost of losing the message, in packets on the cheapest path.
@@ -331,7 +332,7 @@ class Paths:
         )
 
     def _under_way(self) -> list[int]:
-        """Number of packets in flight on each path, sent after the newest acknowledged one."""
+        """Number of packets on each path that were sent after the newest acknowledged packet."""
         since_ns = self._arrived_ns()
         return [
             sum(since_ns is None or packet.sent_ns > since_ns for packet in path.in_flight)
@@ -339,8 +340,8 @@ class Paths:
         ]
 
     def alive_worth(self, now_ns: int) -> float:
-        """Cost if nothing arrives any more: after its time-out the other end considers the link
-        lost.
+        """Cost if nothing arrives any more, in packets of price 1: after its time-out the other end
+        considers the link lost.
         """
         since_ns = self._arrived_ns()
         share = 1.0 if since_ns is None else max(now_ns - since_ns, 0) / self._timeout_ns
@@ -379,13 +380,14 @@ class Paths:
             path.bytes += len(datagram)
 
     def again(self, silence_ns: int, now_ns: int, among: Sequence[int]) -> tuple[bytes, int] | None:
-        """Newest datagram, and another path over which it must be sent again now; None: not now.
+        """Newest datagram, and another path over which it must be sent again now; None if no
+        datagram must be sent again now.
 
         Args:
             silence_ns: longest silence of the other end.
             among: paths that may be used.
         """
-        if self._gaps_ns:  # the other end usually sends before its longest silence
+        if self._gaps_ns:  # the other end usually sends before its longest silence ends
             silence_ns = min(silence_ns, sum(self._gaps_ns) // len(self._gaps_ns))
         for path in self.each:
             path.expire(silence_ns, now_ns)
@@ -406,8 +408,9 @@ class Paths:
         return newest.datagram, best
 
     def looks(self, now_ns: int) -> list[int]:
-        """Paths on which a probe is due: paths that were not used for long, are doubted, or have
-        delivered nothing yet; and the newest packet's path if a missing packet is to be reported.
+        """Paths on which a probe is due: paths that were not used for a long time, are doubted, or
+        have delivered nothing yet; and the newest packet's path if a missing packet is to be
+        reported.
         """
         due = []
         for one, path in enumerate(self.each):

@@ -170,7 +170,8 @@ class Horizon(NamedTuple):
     server_us: int
     age: int
     inputs: NDArray[np.float32]
-    """Desired velocity [m/s]; shape (axes, d + H). The first d, 0 … `ahead_max`, are committed."""
+    """Desired velocity [m/s]; shape (axes, d + H). The first d (0 to `ahead_max`) inputs are
+    committed."""
     feedback: NDArray[np.float32] = NO_FEEDBACK
     """Parameters of the feedback aboard, in the columns REFERENCE_P … GAIN_V; shape (axes,
     FEEDBACK), or (axes, 0) without feedback."""
@@ -341,7 +342,7 @@ def _motion(value: object, ours: Terms) -> tuple[Array, Array]:
     # The sum of float32 numbers is finite if and only if all of them are.
     if not math.isfinite(sum(numbers)):
         raise ProtocolError(Drop.NOT_FINITE)
-    # zip with `strict` takes twice as long. Along splines there are no inputs.
+    # zip with `strict` takes twice as long. With splines `numbers` has no inputs.
     for axis, u in enumerate(numbers[2 * axes :]):
         if abs(u) > ours.u_max[axis] * INPUT_TOLERANCE:
             raise ProtocolError(Drop.INPUT_OUT_OF_RANGE)
@@ -408,12 +409,12 @@ U64 = range(2**64)
 _CLOCK = range(2**63)
 _STAMP = range(STAMPS)
 _NUMBER = range(NUMBERS)
-# An age is negative if the step is before the observation's step, as after the server's clock was
-# set, until its clock map has followed.
+# An age is negative if the step precedes the observation's step. This happens after the server's
+# clock was set, until its clock map has followed.
 _AGE = range(-(2**15), 2**32)
 _SPACING = range(1, 2**16)
 _DOES = 2 * len(Mode)
-"""Number of pairs of an observation's mode and `takes`."""
+"""Number of combinations of an observation's mode and `takes`."""
 
 _TYPES: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     1: (Hello, (U16, U64, _terms)),
@@ -613,7 +614,7 @@ def checked(fields: tuple[Any, ...], terms: Terms) -> Message:
 
 
 def _is_of_a_room(number: int) -> bool:
-    """Load the optional message of this type number; False if no installed package has one."""
+    """Load the optional message of this type number; returns False if none is installed."""
     if module := _ROOMS.pop(number, ""):
         with suppress(ModuleNotFoundError):
             import_module(module)

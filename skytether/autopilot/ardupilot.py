@@ -24,7 +24,7 @@ STATION_ACTIONS = {
     5: FlightMode.LAND,
     7: FlightMode.HOLD,
 }
-"""Modes by the value of FS_GCS_ENABLE; SmartRTL counts as RTL, because no return path is stored."""
+"""Modes by the value of FS_GCS_ENABLE. SmartRTL is simulated as RTL: no return path is stored."""
 BATTERY_ACTIONS = {
     1: FlightMode.LAND,
     2: FlightMode.RETURN,
@@ -54,7 +54,7 @@ class ArduPilot(PilotedVehicle):
         return ""
 
     def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
-        """Number of a mode in a heartbeat: the main mode of the command."""
+        """Number of a mode as heartbeats have it: equal to the main mode in a command."""
         return main
 
     def takes_setpoints(self) -> bool:
@@ -101,7 +101,7 @@ class ArduPilot(PilotedVehicle):
         return min(self.parameters["RTL_ALT"] / 100.0, max(cone, 2.0))
 
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """Whether to brake: no set-point has come for GUID_TIMEOUT."""
+        """Whether the vehicle must brake: no set-point has arrived for GUID_TIMEOUT."""
         past_s = (self.now_ns - setpoint.came_ns) / SECOND_NS
         return past_s > self.parameters["GUID_TIMEOUT"]
 

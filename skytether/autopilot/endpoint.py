@@ -40,7 +40,7 @@ PEERS_MAX = 8
 PATIENCE_NS = SECOND_NS
 """Silence after which a peer may be replaced [ns]."""
 BEHIND_MAX_NS = SECOND_NS
-"""Longest time that is simulated at once after a late wake [ns]; more is skipped."""
+"""Longest time that is simulated at once after a late wake [ns]; time beyond it is skipped."""
 FORCE = 21196.0
 """Magic number that forces arming or disarming."""
 
@@ -335,7 +335,7 @@ class Autopilot(Endpoint):
 
         Args:
             command: MAV_CMD.
-            given: its parameters 1, 2, 3 and 7.
+            given: parameters 1, 2, 3 and 7 of the command.
             peer: sender of the command.
         """
         first, second, third, seventh = given

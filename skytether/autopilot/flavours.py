@@ -45,13 +45,13 @@ class SimulatedFlavour:
     """Whether integer parameters are sent as the bits of a float, see `mavlink.parameters`."""
     gains: Gains
     frame: str
-    """Airframe of the autopilot's own simulator, or the nearest one in FRAMES."""
+    """Airframe of the autopilot's own simulator, or the most similar frame in FRAMES."""
     ready_s: float
     """Time from the start until arming is allowed [s]; the autopilot's filters settle meanwhile."""
     words_for_stations: bool
     """Whether status texts are sent only to ground stations, as PX4 does."""
     fixed_heartbeats: bool
-    """Whether the rate of the autopilot's heartbeats is fixed."""
+    """Whether the rate of the autopilot's heartbeats cannot be changed."""
     stamps_fixes: bool
     """Whether GPS fixes have a timestamp; PX4 sends 0 while its receiver has no date."""
     forwards: bool

@@ -69,7 +69,7 @@ class Landed(Enum):
 
 class CompanionSetpoint(NamedTuple):
     velocity: Vector
-    """Velocity [m/s]; if there is a position, the feed-forward velocity."""
+    """Velocity [m/s]: the target, or the feed-forward velocity if a position is set."""
     position: Vector | None
     """Position [m]; None if only the velocity is set."""
     came_ns: int
@@ -118,7 +118,7 @@ class PilotedVehicle(ABC):
         self.armed_ns: int | None = None
         self.flying = False
         self.estimates = True
-        """Whether the position estimate works. During `ready_s` the estimate is not valid yet."""
+        """Whether the position estimate works. It does not during `ready_s`."""
         self.drift: Vector = REST
         """True minus estimated velocity, as after a failure of the accelerometers [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
@@ -137,7 +137,7 @@ class PilotedVehicle(ABC):
         self.said: list[tuple[Severity, str]] = []
         self.now_ns = 0
         self.station_ns: int | None = None
-        """Time of the ground station's newest heartbeat [ns]; None before: no failsafe then."""
+        """Time of the ground station's newest heartbeat [ns]; None before the first heartbeat."""
         self._ready_ns = seconds_to_ns(ready_s)
         self._setpoint: CompanionSetpoint | None = None
         self._climb: float | None = None
@@ -279,7 +279,7 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def mode_number(self, main: int, sub: int) -> int:
-        """Number of the mode from a command's main mode and sub mode."""
+        """Number of the mode in heartbeats, from a command's main mode and sub mode."""
 
     @abstractmethod
     def takes_setpoints(self) -> bool:
@@ -309,7 +309,7 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def silence(self, setpoint: CompanionSetpoint) -> bool:
-        """Whether set-points have stopped; if so, trigger the failsafe that parameters choose."""
+        """Whether set-points have stopped; this triggers the failsafe that parameters select."""
 
     @abstractmethod
     def watch(self) -> None:
@@ -341,7 +341,7 @@ class PilotedVehicle(ABC):
             self._settle(velocity)
 
     def once(self, failsafe: str) -> bool:
-        """Whether a failsafe is triggered for the first time in this flight."""
+        """Whether a failsafe is triggered for the first time in this flight; the call counts."""
         new = failsafe not in self._announced
         self._announced.add(failsafe)
         return new
@@ -474,7 +474,7 @@ class PilotedVehicle(ABC):
             self._wander[:] = 0.0
 
     def _follow_receiver(self) -> None:
-        """Advance by one tick the estimate's errors that come from the receiver."""
+        """Advance the estimate's errors that come from the receiver by one tick."""
         self._past.append((self.quadrotor.position(), self.quadrotor.velocity()))
         dt = TICK_NS / SECOND_NS
         if not self.fixes:
@@ -505,7 +505,7 @@ class PilotedVehicle(ABC):
 
 
 def _approach(distance: float, p: float, acceleration: float) -> float:
-    """Speed towards a target [m/s]: proportional to a small distance, or to a large one's root."""
+    """Speed towards a target [m/s]: proportional to the distance if near, else to its root."""
     near = acceleration / (p * p)
     if distance <= near:
         return p * distance

@@ -30,7 +30,7 @@ CURRENT_MODE_EXTRA = 193
 
 
 class CurrentMode:
-    """CURRENT_MODE, which the dialect does not have; `mode` is the number of the mode."""
+    """CURRENT_MODE, which pymavlink's dialect lacks; `mode` is the number of the mode."""
 
     def __init__(self, mode: int) -> None:
         self._payload = pack("<IIB", mode, mode, 0)
@@ -88,7 +88,7 @@ class Telemetry:
         )
 
     def gps(self) -> Message:
-        """GPS fix; without a fix until the estimate is ready."""
+        """Message of the GPS receiver. It reports no fix until the estimate is ready."""
         flight = self._flight
         has_fix = flight.ready and flight.fixes
         fix = dialect.GPS_FIX_TYPE_3D_FIX if has_fix else dialect.GPS_FIX_TYPE_NO_FIX

@@ -35,7 +35,7 @@ from skytether.view.frames import of_flight
 class DuelOptions:
     scenarios: Annotated[tuple[str, ...], Argument(positional=True, metavar="SCENARIO")]
     """Two or more names of scenarios (`skytether list scenarios`) or .toml files. All are flown
-    with the network, duration and seed of the first.
+    with the network, duration and seed of the first scenario.
     """
     duration: float | None = None
     """Length of the flights [s]; by default the first scenario's."""

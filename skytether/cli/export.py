@@ -79,7 +79,7 @@ def _traffic(options: ExportOptions, recorded: Recorded) -> None:
             _write(options.traces / f"{name}.csv", trace.encode())
     if options.pcap:
         counted = recorded.figures.get("netem", {})
-        header_bytes = counted.get("header_bytes", HEADER_BYTES)  # of `netem run`, else missing
+        header_bytes = counted.get("header_bytes", HEADER_BYTES)  # only with `netem run`
         _write(options.pcap, traffic.pcap(packets, header_bytes=header_bytes))
 
 

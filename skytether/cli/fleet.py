@@ -89,9 +89,9 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     """Number of steps for which the server planned, all vehicles together."""
     event_ratio: float
     uplink_above: int | None
-    """Plans sent because the trigger's figure was above its threshold; in virtual time only."""
+    """Number of plans sent because of the trigger's figure; in virtual time only."""
     uplink_due: int | None
-    """Plans sent as a heartbeat, by a schedule, or as the first plan; in virtual time only."""
+    """Number of plans sent as heartbeat, by schedule, or as first plan; in virtual time only."""
     rmse_xy: tuple[float, float, float] | None
     """Smallest, median and largest RMSE of the vehicles [m]."""
     separation_m: float | None
@@ -99,17 +99,17 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
     left_tube: int | None
-    """Observations outside a tube (`mission.tube_m`); if any, the separation is not proven."""
+    """Number of observations outside a tube (`mission.tube_m`); only 0 proves the separation."""
     uplink_packets_per_s: float
-    """Packets from the server into the network [1/s]."""
+    """Rate of packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
-    """Packets from the vehicles into the network [1/s]."""
+    """Rate of packets from the vehicles into the network [1/s]."""
     lost: int
-    """Packets that the network lost, both ways."""
+    """Number of packets that the network lost, both ways."""
     dropped: int
-    """Packets dropped because a queue of the kernels or of netem was full."""
+    """Number of packets dropped because a queue of the kernels or of netem was full."""
     drops: dict[str, dict[str, int]]
-    """Packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
+    """Number of packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
     plugin_errors: dict[str, int]
     """Number of errors in the code of plug-ins, by kind, see `Summary.plugin_errors`."""
     tick_ms_p50: float
@@ -117,13 +117,13 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     tick_ms_p99: float
     """99th percentile of the duration of a server's tick, in the slowest worker [ms]."""
     server_missed: int
-    """Ticks that the server's workers missed because they woke too late."""
+    """Number of ticks that the server's workers missed because they woke too late."""
     client_missed: int
-    """Steps that vehicles missed because their process woke too late."""
+    """Number of steps that vehicles missed because their process woke too late."""
     client_late_ms_max: float
     """Longest delay with which a vehicle's step began [ms]."""
     machine_missed: int | None
-    """Steps that a sleeping thread missed meanwhile, which shows how many the machine caused."""
+    """Number of steps missed by a thread that only sleeps. The machine causes these misses."""
     machine_late_ms_max: float | None
     """Longest delay with which the sleeping thread woke [ms]."""
     server_cpu_us: dict[str, float]
@@ -196,7 +196,7 @@ def fleet(argv: Sequence[str]) -> None:
 
 
 def _with_mission(argv: Sequence[str]) -> list[str]:
-    """Replace `--mission` or `--show` by the scenario and the flags for its file."""
+    """Replace `--mission` or `--show` by the scenario and the flags that name its file."""
     missions, rest = plugins.flag_values(argv, "--mission")
     shows, rest = plugins.flag_values(rest, "--show")
     for flag in ("--mission", "--show"):
@@ -291,8 +291,8 @@ class Lateness:
 
 @contextmanager
 def metronome(dt_s: float) -> Iterator[Lateness]:
-    """Run a thread during the block that only sleeps from step to step of `dt_s`. A step that it
-    misses was missed because of the machine, not because of our code.
+    """During the block, run a thread that only sleeps from step to step of `dt_s`. If this thread
+    misses a step, the machine is the cause and not our code.
     """
     late, over = Lateness(), threading.Event()
 

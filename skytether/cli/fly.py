@@ -54,9 +54,9 @@ PRINTED_OF_ROOMS = ("LeaderChanged",)
 POLL_S = 0.2
 """Interval at which Ctrl-C is checked while the page stays open [s]."""
 Flown = tuple[Scenario, "Future[Record]"]
-"""Scenario of --beside, and the future record of its flight, which another process flies."""
+"""Scenario of --beside, and a future with the record of its flight, flown in another process."""
 ON_THE_GROUND = {str(mode) for mode in (Mode.INIT, Mode.SYNC, Mode.READY)}
-"""Modes before the first plan is flown; their changes are not printed."""
+"""Modes before the first plan is flown; changes between them are not printed."""
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def fly(argv: Sequence[str]) -> None:
     if not options.virtual:
         for warning in command.flight_warnings(scenario):
             page_process.say(warning)
-    # This compiles the vehicle's kernels; without a vehicle it fails before any process starts.
+    # Compiles the vehicle's kernels; if the vehicle cannot be made, no process is started.
     vehicles.make(scenario, 0)
     at = options.page or os.environ.get(page_process.VARIABLE, HOST_PORT)
     page = None if options.virtual or options.no_page else at

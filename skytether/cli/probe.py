@@ -445,7 +445,7 @@ def _missing(delays: Delays) -> int:
 
 
 def _of_log(path: PathFigures) -> str:
-    """Sentences about data that a log lacks, and what is assumed instead."""
+    """Sentences about data that a log lacks, and about the assumptions made instead."""
     if path.log == "one way":
         return "Clocks: unknown. The file has the delays of one direction, which are used for both."
     return (

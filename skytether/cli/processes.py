@@ -256,7 +256,7 @@ def run(
     timeout_s = scenario.duration + scenario.link.connect_s + GRACE_S
 
     def common(name: str, *, recorded: bool) -> list[str]:
-        # `fly` always begins a new flight.
+        # `skytether fly` always begins a new flight, so no client continues an earlier one.
         arguments = ["--json", str(parts / f"{name}.json"), "--new-flight"]
         if recorded:
             arguments += ["--record", str(parts / name)]

@@ -84,7 +84,7 @@ def beside() -> int:
 class _Source:
     begun: bool = False
     ended: bool = False
-    """Whether the feed has ended and was not opened again yet."""
+    """Whether the feed has ended and has not been opened again since."""
     resumed: bool = False
     """Whether the next frames may repeat earlier ones."""
     last_ns: int = 0

@@ -63,7 +63,7 @@ def replay(argv: Sequence[str]) -> None:
 
 
 def theorem_html(recorded: Recorded) -> str:
-    """What the theorem of separation assumes, as HTML; empty unless the flight is a mission."""
+    """Assumptions of the separation theorem, as HTML; empty unless the flight is a mission."""
     if not recorded.scenario.keeps_apart:
         return ""
     from skytether.theorem.judgement import judged

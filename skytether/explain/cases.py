@@ -26,7 +26,7 @@ Keys: TypeAlias = tuple[tuple[str, Any], ...]
 
 
 ENDS = ("control", "link", "vehicle", "sensor")
-"""Sections of keys that may be the cause, if they differ from the named scenario's keys."""
+"""Sections whose keys may be the cause, where their values differ from the named scenario."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ class UsualDelay:
 
 @dataclass(frozen=True, slots=True)
 class Unmet:
-    """Losses and delays that the network had for packets that this flight did not send."""
+    """Losses and delays of the network in slots in which this flight sent no packet."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class Stall:
-    """Time for which a process is stopped: the process receives no packets and is not woken."""
+    """Stall of a process: for this time it receives no packets and is not woken."""
 
     process: Literal["server", "client"]
     at_s: float
@@ -81,10 +81,10 @@ class Stall:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Change of a key in flight by a person."""
+    """Change of a key that a person made in flight."""
 
     at_s: float
-    """Time of flight [s]."""
+    """Time of flight of the change [s]."""
     key: str
     value: Any
 
@@ -122,7 +122,7 @@ class FlightCase:
     stalls: tuple[Stall, ...] = ()
     commands: tuple[Command, ...] = ()
     overridden: Keys = ()
-    """Keys whose values differ from the named scenario's, with the named scenario's values."""
+    """Keys that differ from the named scenario, with their values in that scenario."""
     keys: Keys = ()
     delivered: tuple[tuple[Stretch, float], ...] = ()
     """Stretches in which every packet arrives, each with the longest delay in it [s]."""
@@ -158,7 +158,7 @@ class FlightCase:
 
 
 def overridden(scenario: Scenario, name: str) -> Keys:
-    """Keys of ENDS that differ from the named scenario's, with the named scenario's values."""
+    """Keys of ENDS that differ from the named scenario, with their values in that scenario."""
     try:
         named = dict(dotted.flat(reading.to_table(reading.load(name))))
     except ConfigError:  # a recording's scenario, whose file is elsewhere

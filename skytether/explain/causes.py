@@ -1,8 +1,8 @@
-"""Cause of a moment: the smallest set of units that suffices, and the effect of each.
+"""Cause of a moment: the smallest set of units that suffices for it, and the effect of each unit.
 
 Three groups of units are tried: units shortly before the moment, units from the flight's beginning
-on, and these units with the usual delay. The search uses the first group without which the moment
-does not occur; if there is no such group, the cause is the scenario.
+on, and the same units together with the usual delay. The search uses the first group without which
+the moment does not occur; if there is no such group, the cause is the scenario.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,12 +29,12 @@ from skytether.explain.units import PUSH, Circumstances
 from skytether.shared.endpoints.directions import FLIGHT
 
 BEFORE_S = 8.0
-"""Time before a moment in which its cause is searched first [s]. It is longer than two time-outs, a
-horizon and the delays together."""
+"""Length of the interval before a moment that is searched first for the moment's cause [s]. It is
+longer than two time-outs, a horizon and the delays together."""
 SHORTEST_MS = 20
-"""Accuracy of the length of the shortest outage that suffices [ms]."""
+"""Resolution of the bisection for the shortest outage that still causes the moment [ms]."""
 PACKETS_MAX = 64
-"""Number of newest packets before the moment that `rescues` delivers one at a time."""
+"""Largest number of packets, the newest, that `rescues` delivers, each in a flight of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class CausePart:
     plans: int = 0
     """Number of plans among these packets."""
     shortest_s: tuple[float, float] | None = None
-    """Lengths of the shortest sufficient outage with this begin, and with this end [s]; sorted."""
+    """Lengths of the shortest sufficient outages with the unit's beginning and with its end [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Cause:
     error_m: float
     """Largest error with this cause alone [m]."""
     averting: tuple[CausePart, ...] = ()
-    """Smallest set without which the moment does not occur; empty if removing `parts` suffices."""
+    """Smallest set without which the moment does not occur; empty if `parts` is such a set."""
     others: tuple[CausePart, ...] = ()
     """Losses and late packets that were examined, but are neither in `parts` nor in `averting`."""
     innocent: tuple[tuple[str, float], ...] = ()
@@ -188,7 +188,7 @@ def needed(
 
 
 def _groups(found: Cause, here: Circumstances) -> dict[str, list[Unit]]:
-    """Units that are not in the cause, by kind."""
+    """Units that are in neither `parts` nor `averting` of the cause, by kind."""
     groups: dict[str, list[Unit]] = {}
     for unit in here.units:
         if unit != Unmet() and all(unit != part.unit for part in (*found.parts, *found.averting)):
@@ -240,7 +240,7 @@ def lane_name(lane: Lane) -> str:
 def rescues(
     found: Cause, here: Circumstances, moment: Moment, flown: CaseOutcome, fly_all: FlyAll
 ) -> Rescues:
-    """Packets of the cause, sent before the moment, each of which alone averts it if delivered."""
+    """Packets of the cause, sent before the moment, whose delivery alone averts the moment."""
     packets = flown.packets
     bad = [part.unit for part in found.parts if isinstance(part.unit, Bad)]
     numbers = sorted(number for unit in bad for number in _met(unit, flown))

@@ -121,7 +121,7 @@ def _judge(options: ExplainOptions, recorded: Recorded) -> None:
 
 
 def _recorded(recorded: Recorded) -> tuple[str, FlightCase, str | Track]:
-    """Scenario name, case, and hash of a recorded flight; over UDP its track in place of the hash.
+    """Scenario name, case, and hash of a recorded flight; over UDP a track instead of the hash.
 
     Raises:
         CommandError: the flight cannot be flown again.

@@ -81,14 +81,14 @@ class Late(Steady):
 
     def next_wake_ns(self) -> int | None:
         due_ns = super().next_wake_ns()
-        if due_ns is None or due_ns < MIDNIGHT_NS:  # no wake, or one at once
+        if due_ns is None or due_ns < MIDNIGHT_NS:  # no wake is due, or one immediately
             return due_ns
         return due_ns + self._late_ns.get(due_ns - MIDNIGHT_NS, self._usual_ns)
 
 
 @impairment(name="doubled")
 class DoubledPath(Trace):
-    """Delays or loses each packet like the recorded packet with the same slot and rank."""
+    """Delays or loses each packet like the recorded packet with its slot and its rank there."""
 
     def __init__(self, file: File) -> None:
         super().__init__(file, "once")
@@ -99,7 +99,7 @@ class DoubledPath(Trace):
         }
 
     def __call__(self, fate: Fate, draws: Draws) -> None:
-        """Apply the fate of the recorded packet; between recorded packets, interpolate."""
+        """Apply the fate of the recorded packet; between two recorded packets, interpolate."""
         if (known := self._fates.get((fate.slot, fate.rank))) is None:
             super().__call__(fate, draws)
             return
@@ -108,7 +108,7 @@ class DoubledPath(Trace):
 
 
 class PushedPlant(FirstOrderPlant):
-    """Plant in calm air that starts in the recorded vehicle's state and is pushed as recorded."""
+    """Plant without wind; a share of the recorded deviation is added to its state at each step."""
 
     def __init__(self, scenario: Scenario, flown: Double, share: float) -> None:
         super().__init__(scenario, Weather(scenario, stream(scenario.seed, "calm")))
@@ -131,7 +131,7 @@ class PushedPlant(FirstOrderPlant):
 
 
 class Ground(Endpoint):
-    """Port of a vehicle that is in the air from a given time of its clock on."""
+    """Port of a vehicle that is in the air from the time `up_ns` of its clock on."""
 
     def __init__(self, up_ns: int) -> None:
         super().__init__()

@@ -4,8 +4,9 @@
 
 The double has the recording's scenario, seed and time at which the session opened. Both ends are
 woken as late as recorded. A packet has the fate of the recorded packet of the same time; between
-two recorded packets its delay is interpolated, and its loss is that of the nearer. So each packet
-is handled before the same tick as recorded, and `in_force` and `observed_step` are as recorded.
+two recorded packets its delay is interpolated, and its loss is that of the nearer packet. So each
+packet is handled before the same tick as recorded, and `in_force` and `observed_step` are as
+recorded.
 
 **A real vehicle** is replaced by the scenario's model, pushed at each step by the recorded
 deviation from the model (`doubled`). What the vehicle would have done with other inputs is less
@@ -45,13 +46,13 @@ if TYPE_CHECKING:  # the module needs the library of MCAP
 NEAR_M = 0.1
 """A double is refused if its distance from the recording exceeds this before the moment [m]."""
 NOWHERE = 2**16 - 1
-"""Number for the path of packets that the server exchanged with others than the client."""
+"""Path number of packets that the server exchanged with peers other than the client."""
 SENT = Happened.SENT
 ENDS: tuple[Literal["client", "server"], ...] = ("client", "server")
 ASIDE_NS = 5 * MILLISECOND_NS
 """Time after a stall within which packets that arrived during the stall are handled [ns]."""
 SIMULATED = "simulated", "quadrotor"
-"""Kinds of simulated vehicles, whose flight the seed repeats; others are replaced by a model."""
+"""Kinds of simulated vehicles: the seed determines their flight. Other kinds fly as a model."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +73,7 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
     """Case of the double of a recorded flight, and track of the recorded flight.
 
     Raises:
-        ConfigError: the recording does not have what a double needs.
+        ConfigError: the recording lacks data that a double needs.
     """
     scenario, dt_ns, rows = recorded.scenario, recorded.scenario.dt_ns, recorded.parts["client"]
     client, server = ends = _ends(recorded)
@@ -102,7 +103,7 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
         gone = (changes for name, changes in SETTINGS if name != COMPUTING)
         keys |= dict(chain.from_iterable(gone))
         keys["vehicle.kind"] = DOUBLED
-    # The vehicle's port is due 1 ns before step 0, and woken 1 ns late: then the vehicle is up.
+    # The vehicle's port is due 1 ns before step 0 and woken 1 ns late: it is in the air at step 0.
     late_ns[0][began_ns - zero_ns - 1] = 1
     opens_s, (states, inputs) = (opens_ns[0] - zero_ns) / SECOND_NS, _steps(rows)
     sends = bool((client["due_ns"][_causes(client)[client["happened"] == SENT]] == began_ns).any())
@@ -141,8 +142,8 @@ def _ends(recorded: "Recorded") -> tuple[Rows, Rows]:
 
 
 def _on_paths(client: Rows, server: Rows) -> Rows:
-    """The server's rows with the client's path numbers as `peer`, found by the packets that were
-    sent only once; the client numbers its paths in the order of their first use.
+    """The server's rows, with the client's path numbers as `peer`. Packets that were sent only once
+    show which path is which; the client numbers its paths in the order of their first use.
     """
     both = Counter[tuple[int, int]]()
     for sender, receiver in ((client, server), (server, client)):
@@ -169,7 +170,7 @@ def _of(rows: Rows, happened: Happened) -> Rows:
 
 
 def _began_ns(recorded: "Recorded", client: Rows) -> int:
-    """Time of step 0 [ns]: the wake near `Flying` from which most wakes are whole steps away."""
+    """Time of step 0 [ns]: the wake near `Flying` that is whole steps away from most wakes."""
     times_ns = (at_ns for at_ns, _, event in recorded.events() if isinstance(event, Flying))
     flying_ns, dt_ns = recorded.begin_ns + next(times_ns, 0), recorded.scenario.dt_ns
     due_ns = _of(client, Happened.WOKEN)["due_ns"]
@@ -188,13 +189,13 @@ def _causes(rows: Rows) -> Indices:
 
 
 def _arrivals(sender: Rows, receiver: Rows) -> dict[int, int]:
-    """Number of the receiver's row by number of the sender's row, of packets that arrived."""
+    """Number of the receiver's row, by number of the sender's row, for packets that arrived."""
     sent, found = defaultdict[tuple[int, int], list[int]](list), dict[int, int]()
     for number in np.flatnonzero(sender["happened"] == SENT).tolist():
         sent[_packet(sender[number])].append(number)
     for number in np.flatnonzero(receiver["happened"] == Happened.RECEIVED).tolist():
         equal = sent[_packet(receiver[number])]
-        # Of identical packets, such as repeated HELLOs, the newest one sent before the arrival.
+        # Of identical packets, such as repeated HELLOs, the newest sent before the arrival counts.
         before = sum(sender["time_ns"][each] <= receiver["time_ns"][number] for each in equal)
         if equal:
             found[equal.pop(max(0, before - 1))] = number

@@ -17,7 +17,7 @@ from skytether.shared.base.errors import ConfigError
 AT_MAX_S = 2.0
 """Largest distance of a moment from the requested time [s]."""
 CURVES_MAX = 2
-"""Largest number of flights without a part of the cause that the picture shows."""
+"""Largest number of flights, each without one part of the cause, that the picture shows."""
 STEPS = 6
 """Number of steps of an explanation, not counting flights of other seeds."""
 FIRST = "what went wrong"

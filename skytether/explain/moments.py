@@ -29,9 +29,9 @@ from skytether.shared.wire.protocol import Mode
 FAR_TIMES = 3.0
 """An error is large above this multiple of the usual error, plus `FAR_STEPS`."""
 FAR_STEPS = 2.0
-"""Added to the bound on errors, in steps at full speed: two steps correct any smaller error."""
+"""Margin added to the bound on errors, in steps at full speed: two steps correct it."""
 AROUND_S = 1.0
-"""The usual error at a step is the perfect flight's largest within this time of the step [s]."""
+"""The usual error at a step is the perfect flight's largest error within this time of it [s]."""
 AFTER_S = 5.0
 """Time after a moment within which its largest error is searched for [s]."""
 PAUSE_S = 1.0
@@ -39,7 +39,7 @@ PAUSE_S = 1.0
 NEAR = 1.05
 """Two vehicles are too near below this multiple of the required separation."""
 WASTED_TIMES, WASTED_PER_S = 3.0, 10.0
-"""Plans are wasted if their rate exceeds the perfect flight's by this factor and excess [1/s]."""
+"""Plans are wasted above the perfect flight's rate times this factor and plus this excess [1/s]."""
 
 ALIVE = 0.5
 """A path was not dead if a larger share of its packets arrived."""
@@ -64,12 +64,12 @@ class Moment:
     figure: float
     """Largest error during the moment [m], or smallest separation [m], or rate of packets [1/s]."""
     usual: float
-    """The same figure of the perfect flight."""
+    """Value of `figure` in the perfect flight."""
     level: float
-    """Least value of `measured` with which the moment occurs in another flight."""
+    """The moment occurs in another flight if `measured` returns at least this for that flight."""
     calm: float
-    """Largest value of `measured` with which the moment is clearly averted: `usual` plus a quarter
-    of the excess. `level` is `usual` plus half of the excess."""
+    """The moment is clearly averted if `measured` returns at most this: `usual` plus a quarter of
+    the excess. `level` is `usual` plus half of the excess."""
 
 
 def moments(flown: CaseOutcome, perfect: CaseOutcome, scenario: Scenario) -> list[Moment]:
@@ -89,7 +89,7 @@ def moments(flown: CaseOutcome, perfect: CaseOutcome, scenario: Scenario) -> lis
 
 
 def worst(found: Sequence[Moment]) -> Moment:
-    """Default moment to explain: of the gravest kind, the largest deviation from `usual`."""
+    """Default moment to explain: of all moments of the gravest kind, the farthest from `usual`."""
 
     def weight(each: Moment) -> tuple[int, float]:
         return WEIGHTS[each.kind], abs(each.figure - each.usual)

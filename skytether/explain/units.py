@@ -148,7 +148,7 @@ def _between(stretch: Stretch, bad: Collection[Bad]) -> Iterator[Stretch]:
 def circumstances(
     case: FlightCase, flown: CaseOutcome, start_s: float, end_s: float, *, with_delay: bool = False
 ) -> Circumstances:
-    """Circumstances of a flight between two times in it [s].
+    """Circumstances of a flight, with its units between two times of flight [s].
 
     Args:
         with_delay: whether the usual delay of each direction is a unit as well.
@@ -187,12 +187,12 @@ def _usual_s(flown: CaseOutcome, lane: Lane) -> float:
 
 
 def _settings(case: FlightCase) -> Iterator[Setting]:
-    """Overridden keys of a scenario, and those of SETTINGS that it has, as units."""
+    """Units for a scenario's overridden keys, and for the SETTINGS that the scenario has."""
     listed = {key for _, keys in SETTINGS for key, _ in keys}
     keys = tuple(each for each in case.overridden if each[0] not in listed)
     some = [each for count in range(1, len(keys)) for each in combinations(keys, count)]
     is_each = len(keys) <= KEYS_MAX and all(map(partial(is_possible, case), some))
-    for each in [(key,) for key in keys] if is_each else [keys]:  # else all are one unit
+    for each in [(key,) for key in keys] if is_each else [keys]:  # else all keys form one unit
         if keys and is_possible(case, keys):
             table = reading.to_table(case.scenario)
             names = (f"{key} = {dotted.value(table, key)}" for key, _ in each)
@@ -210,7 +210,7 @@ def is_possible(case: FlightCase, keys: Keys) -> bool:
 
 
 def _is_there(scenario: Scenario, keys: Keys) -> bool:
-    """Whether a scenario has another list, or a larger number, for one of the keys."""
+    """Whether one of the keys has another list, or a larger number, in the scenario."""
     for key, value in keys:
         section, _, name = key.partition(".")
         own = getattr(getattr(scenario, section), name)

@@ -108,7 +108,7 @@ def _counted(parts: Iterable[CausePart]) -> list[str]:
 
 
 def _noun(unit: Unit) -> tuple[str, str]:
-    """Noun of a unit, and its direction; empty for a unit without a direction, such as wind."""
+    """Noun of a unit, and its direction in words. A unit such as wind has an empty direction."""
     if not isinstance(unit, Bad):
         return named(unit), ""
     return WHAT[unit.is_late, unit.is_packet], f"of the {FLIGHT[unit.lane[1]]}"
@@ -121,7 +121,7 @@ def _kind(part: CausePart) -> object:
 
 
 def _row(parts: Sequence[CausePart], moment: Moment) -> list[str]:
-    """Cells of a row: lane, time, lost packets, length that is enough, result without the part."""
+    """Cells of a row: lane, time, lost packets, sufficient length, result without the part."""
     first, last = parts[0], parts[-1]
     unit, plans = first.unit, sum(part.plans for part in parts)
     times = dict.fromkeys(f"{each:.1f}" for each in (first.start_s, first.end_s))
@@ -146,7 +146,7 @@ def _row(parts: Sequence[CausePart], moment: Moment) -> list[str]:
 
 def _without(parts: Sequence[CausePart], moment: Moment) -> str:
     needed = sum(part.is_needed for part in parts)
-    if math.isnan(parts[0].error_m) and not needed:  # not flown without it yet
+    if math.isnan(parts[0].error_m) and not needed:  # the flight without this part is not flown yet
         return ""
     if len(parts) > 1:
         return f"{needed} of {len(parts)} needed by itself"

@@ -51,7 +51,7 @@ class Decided(Trigger):
     Args:
         vehicle: number of the vehicle in each row; shape (capacity,).
         thresholds: threshold of `expected_gap` by vehicle; with an infinite threshold no plan is
-            sent, with one below 0 every plan.
+            sent, with a threshold below 0 every plan is sent.
     """
 
     doubts = True

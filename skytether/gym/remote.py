@@ -36,10 +36,10 @@ UNDER_WAY_MAX = 4096
 DELAY_STEPS_MAX = 4096
 ANSWER_BYTES = 22
 """Size of an answer without its rows [B]: session, generation, step of the first row (8 B), number
-of rows (2 B), checksum; 4 B for each field without a number."""
+of rows (2 B), checksum; fields without a number in brackets have 4 B."""
 REPORT_BYTES = 36
 """Size of a report without its observation [B]: session, step (8 B), the player's number of the
-step (8 B), newest generation held, the step at which that arrived (8 B), checksum."""
+step (8 B), newest generation held, step of its arrival (8 B), checksum."""
 PART_BYTES = 12
 """Size of a datagram's header in a split message [B]: message, number, count; as large as RTP's."""
 
@@ -59,7 +59,7 @@ class ObservationReport(NamedTuple):
 
     step: int
     number: int
-    """Number of the step by the robot's player: the default of `Chunk.first` of an answer."""
+    """Step number by the count of the robot's player, the default of `Chunk.first` of an answer."""
     acknowledged: int
     """Generation (number) of the newest chunk that the robot held; 0 without a chunk."""
     since: int

@@ -53,7 +53,8 @@ class CalibrateOptions:
     """Initial step size, as a share of each key's range."""
     pool: PoolFlags = Flags()
     out: Path = Path("calibration")
-    """Folder for every point flown (journal.jsonl) and the scenario of the best (best.toml)."""
+    """Folder for every point flown (journal.jsonl) and the scenario of the best point (best.toml).
+    """
     config: ScenarioFlags = Scenario()
 
 

@@ -62,7 +62,8 @@ class IdentifyOptions:
     written scenario extends it."""
     speed: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
     """Size of the velocity steps [m/s], one number for all axes or one for each axis. By default
-    the reference's largest speed on the axis, but at least half of its largest speed on any."""
+    the reference's largest speed on the axis, but at least half of its largest speed on any axis.
+    """
     also: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
     """Further sizes of velocity steps to fly [m/s], to measure the errors of models that are
     identified at other sizes."""

@@ -46,7 +46,7 @@ def margins(argv: Sequence[str]) -> None:
 
     The server plans with the scenario's model. The first row has the scenario's own vehicle; in the
     other rows the vehicle differs as described. The second table has limits, found by bisection:
-    how far one quantity may differ from the model's before the loop is no longer stable. For
+    how far one quantity may differ from the model's value before the loop is no longer stable. For
     pushes, a trigger that uses the state is replaced by a periodic trigger with the same mean rate,
     because a weak push stays below every threshold.
     """

@@ -174,7 +174,7 @@ class Crew:
     def search(
         self, search: Search, out: Path, generations: int, text: str = ""
     ) -> Iterator[list[SearchPoint]]:
-        """All points of a search so far, after each generation; storage, errors as in `study`."""
+        """Yield all points so far after each generation of a search; errors as in `study`."""
 
         def fly_all(cells: Mapping[Point, Scenario]) -> Mapping[Point, Values]:
             kind, settings = dict[str, dict[str, float | None]], search.settings()

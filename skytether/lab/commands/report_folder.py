@@ -37,7 +37,7 @@ class CommandCall:
         return cls(shlex.join(["skytether", name, *argv]), datetime.now(UTC), time.monotonic())
 
     def facts(self, runs: int) -> dict[str, Any]:
-        """Facts about the call for the report; `runs` is the number of flights in the call."""
+        """Facts about this call of the command, for the report; `runs` is its number of flights."""
         return {
             "command": self.command,
             "date": self.began.isoformat(timespec="seconds"),

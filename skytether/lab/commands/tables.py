@@ -9,7 +9,7 @@ from rich.text import Text
 from skytether.shell.commandline import terminal
 
 AROUND = 3
-"""Width of the frame and space around a cell."""
+"""Width of the frame and space around a cell [characters]."""
 
 Cells = Sequence[Sequence[str]]
 

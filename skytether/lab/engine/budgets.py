@@ -31,8 +31,8 @@ from skytether.shared.scenario.whole import Scenario
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 """Budgets: largest numbers of packets per second, both directions together, with heartbeats."""
 SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
-"""Budgets for which points are chosen [packets/s]: BUDGETS, and 4.5 for `comparison.CLAIMS`, which
-is slightly less than 12 % of the packets of the paper's scheme when that sends at every step.
+"""Budgets for which points are chosen [packets/s]: BUDGETS, and 4.5 for `comparison.CLAIMS`:
+slightly less than 12 % of the packets of the paper's scheme with the trigger `always`.
 """
 CLOSE = 1.05
 """A threshold between two neighbouring thresholds is tried if their ratio is at least this."""
@@ -113,7 +113,7 @@ def flying(contender: Contender, case: Case, tuned: Scenario) -> list[FlownConte
 
 
 Chosen = Mapping[tuple[str, float], FlownContender]
-"""Point of each contender within each budget, by the contender's name and the budget [1/s]."""
+"""Best point of each contender within each budget, by the contender's name and the budget [1/s]."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Objectives of searches: to reproduce the paper's Table 1, or the smallest error within limits.
+"""Objectives of searches: to reproduce the paper's Table 1, or to minimise the error within limits.
 
 A point of a search is a scenario. An objective (`search.Objective`) flies every point with the same
 seeds, and scores the flights. A smaller score is better.
@@ -36,7 +36,7 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
         "event_ratio": 0.1,
     },
 }
-"""Entries of the paper's Table 1 [m]; the event ratio stands for the paper's "10 times smaller"."""
+"""Entries of the paper's Table 1: errors [m], and the event ratio ("10 times smaller")."""
 
 TOLERANCE = 0.1
 """An entry counts as reproduced up to this relative deviation, an event ratio up to twice this."""
@@ -116,7 +116,7 @@ WEIGHTS = (
 REGULATOR = (WEIGHTS[0], *WEIGHTS[3:])
 """Weights that a trajectory scheme uses: for planning, and for the regulator aboard."""
 SPLINE_KEYS = (Free("control.spline_error_m", 1e-3, 1e-1),)
-"""Key that a search also varies if a trajectory scheme knows the reference in advance."""
+"""Key that a trajectory scheme's search also varies if the reference is known in advance."""
 TRIGGER_KEYS: Mapping[str, Sequence[Free]] = {
     "state_gap": (
         Free("control.trigger.state_gap.epsilon", 1e-4, 1e8),
@@ -194,7 +194,7 @@ class Rmse:
         return rmse * math.prod(max(1.0, each) ** 3 for each in over)
 
     def _binds(self) -> bool:
-        """Whether the limit of the event ratio applies: only to triggers that use the state."""
+        """Whether the event ratio is limited: if the trigger uses the state, see TRIGGER_KEYS."""
         named = leaves(TRIGGERS.parse(self.scenario.control.trigger))
         return any(each.name in TRIGGER_KEYS for each in named)
 

@@ -95,7 +95,8 @@ class ContenderRuns:
 class ComparedCase:
     case: Case
     bought: Mapping[tuple[str, float], ContenderRuns]
-    """Runs of each contender's best point within each budget, by its name and the budget [1/s]."""
+    """Flights of each contender at its best point (weights, threshold and report) within each
+    budget, by the contender's name and the budget [packets/s]."""
     tuned: Sequence[FlownContender] = ()
     """Each contender at the threshold that the search for weights found."""
     floor: Sequence[Floor] = ()

@@ -111,8 +111,8 @@ COST_GAP = {"trigger": "cost_gap(300.0)"}
 EXPECTED_GAP = {"trigger": "expected_gap(300.0)"}
 SILENT = {"trigger": "cost_gap(3.0) | silence(1)"}
 ACKNOWLEDGED = {"trigger": "expected_gap(3.0) | heartbeat"}
-"""Trigger for trajectories. Its threshold is smaller than for horizons, because the cost is that of
-one step, not of all steps of a horizon.
+"""Trigger for trajectories. Its threshold is smaller than for horizons, because the cost covers one
+step, not all steps of a horizon.
 """
 
 
@@ -195,14 +195,14 @@ def _unsearched(name: str, title: str, keys: Mapping[str, Any]) -> Case:
 
 
 def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -> Case:
-    """Case on the paper's circle; costs and thresholds are hundreds of times smaller there."""
+    """Case on the paper's circle, where costs and thresholds are hundreds of times smaller."""
     small = {"trigger.cost_gap": 1.0, "trigger.expected_gap": 1.0, "trigger.state_gap": 300.0}
     round_ = {**keys, "duration": 32.5}  # one full circle after `settle`, which RMSE leaves out
     return Case(name, title, "paper", round_, effort_mps, contenders=CIRCLE, start=small)
 
 
 def _network(argument: str, value: Any) -> Mapping[str, Any]:
-    """Keys that set an argument in both directions of the network; with "", all impairments."""
+    """Keys that set an argument in both directions of the network; "": all impairments."""
     at = f".{argument}" if argument else ""
     return {f"network.{way}{at}": value for way in ("uplink", "downlink")}
 

@@ -7,11 +7,11 @@ two kinds of flights.
            growth = lim h(n+1) / h(n), of the mean square; below 1 the loop is stable
     wind   only the scenario's white wind and noise: root mean square of p and u
 
-The growth is that of the linear loop in the position's deviation p. Bounds: only steps before an
-input u reaches SMALL of its bound are used. Noise: the flight is repeated without the push, and p
-is the difference of the flights. Thresholds: a weak push stays below them, and a trigger that uses
-the state would never send, so a periodic trigger with its measured rate replaces it. Flights in
-wind use the scenario's own trigger.
+The growth is that of the linear loop, so three influences are removed from the deviation p of the
+position. Bounds: only steps before an input u reaches SMALL of its bound are used. Noise: the
+flight is repeated without the push, and p is the difference of both flights. Thresholds: after a
+weak push a trigger that uses the state would never send, so a periodic trigger of the same rate
+replaces it. Flights in wind use the scenario's own trigger.
 """
 
 import math
@@ -48,13 +48,15 @@ above the rounding errors of messages with a noise of some centimetres.
 FLOOR = 1e-9
 """A mean square counts as rounding error below this share of the largest mean square."""
 SETTLE_S, ROUND_TRIPS = 5.0, 4.0
-"""Time before a push: a time [s], plus a number of mean round trips. When the push begins, sessions
-are open, and the delay bound is stationary.
+"""Time before a push: this many seconds, plus this many mean round trips. When the push begins,
+sessions are open and the delay bound is stationary.
 """
 WIND_S, WIND_BUILDS_S = 60.0, 10.0
-"""Time for which the response to wind is evaluated, and time before in which it builds up [s]."""
+"""Time for which the response to wind is evaluated, and time before that in which it builds up [s].
+"""
 SMALL = 0.05
-"""A response is evaluated until an input reaches this share of its bound: so no bound is active."""
+"""A response is evaluated until an input reaches this share of its bound, so that no bound is
+active."""
 STEPS_MIN = 10
 """Smallest number of steps from which a growth can be estimated."""
 WIND_ALONE = 0.1

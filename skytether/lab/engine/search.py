@@ -172,7 +172,8 @@ class SearchPoint:
 Point = tuple[float, ...]
 """Values of the free keys, in order; they identify a point in the journal."""
 FlyAll = Callable[[Mapping[Point, Scenario]], Mapping[Point, Values]]
-"""Function that returns the figures of scenarios, after flying those without stored figures."""
+"""Function that returns the figures of scenarios, after flying the scenarios without stored
+figures."""
 
 
 @dataclass(frozen=True, slots=True)

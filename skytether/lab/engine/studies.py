@@ -98,7 +98,7 @@ class Study:
     scenario: Scenario
     """Scenario to fly, whose parameter is replaced."""
     axis: GridAxis
-    """Values of the parameter, and the keys that each changes."""
+    """Values of the parameter, and the keys that each value changes."""
     runs: int
     here: float
 
@@ -160,7 +160,8 @@ def curve_studies(scenario: Scenario, scale: ReproductionSize) -> list[Study]:
         return {f"network.{way}.{key}": keys[key] for way in directions for key in keys}
 
     def jitter(std_ms: float) -> Mapping[str, Any]:
-        # A Poisson variable's variance equals its mean; the offset keeps the mean delay.
+        # A Poisson variable's variance equals its mean, so more jitter means a longer mean delay;
+        # the minimum is lowered by as much.
         slots = (std_ms / 1e3 / slot_s) ** 2
         least_s = round(up.mean_s - slot_s * slots, 9)
         return both_ways({"paper.slots_mean": slots, "paper.minimum_s": least_s})

@@ -20,7 +20,7 @@ AXES = "xyz"
 BEYOND = 1.5
 """Largest allowed input, divided by the largest step: larger inputs were not measured."""
 FASTER = 1.25
-"""Required speed, divided by the speed of the reference or of the fence's wind."""
+"""Speed that the input bound must allow, divided by that of the reference or the fence's wind."""
 DIGITS = 4
 
 
@@ -124,8 +124,8 @@ def _rounded(number: float) -> float:
 
 
 def _u_max(flown: Scenario, axes: Sequence[AxisOutcome], numbers: Sequence[Numbers]) -> list[float]:
-    """Bounds of the input [m/s]: sufficient for the reference and the fence's wind,
-    otherwise within the measured range.
+    """Bounds of the input [m/s]: enough for the reference, the fence's wind and the largest step,
+    but at most the bounds that were flown.
     """
     wind_mps = flown.fence.wind_mps if flown.fence.is_there else 0.0
     wanted = [max(speed, wind_mps) for speed in reference_speeds(flown)]

@@ -10,9 +10,9 @@ from skytether.lab.identify.steps import FlownStep
 from skytether.shared.base.units import SECOND_NS
 
 LOOKBACK = 2.0
-"""Time before a step from which earlier inputs are included in its response, in step durations."""
+"""Interval before a step whose inputs are included in the step's response, in step durations."""
 LEAD = 0.25
-"""Time before a step from which measurements are included, in step durations. Without a dead time
+"""Interval before a step whose measurements are included, in step durations. Without a dead time
 only these measurements distinguish the gain from wind.
 """
 SAMPLES_MIN = 10

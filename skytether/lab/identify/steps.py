@@ -173,7 +173,7 @@ class Experiment:
     def _direction(self, axis: int) -> float:
         """Direction in which the fence leaves space for a step: 1 or -1; 0 without such space.
 
-        Up is tried first, and down only if the fence has a lower bound.
+        On the vertical axis -1 is tried only if the fence has a lower bound.
         """
         speed = self.plan.speeds[axis]
         ways = (1.0, -1.0) if axis != ALTITUDE or self._has_floor else (1.0,)

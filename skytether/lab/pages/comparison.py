@@ -266,7 +266,7 @@ SPENT = {
 }
 COLOURS = ("#c1272d", "0.5", "black", "#009e73")
 MARKERS = "sovD^P<*"
-"""Markers of the triggers, in order; curves can be distinguished without colour."""
+"""Markers of the triggers, in order; so curves can be told apart without colour."""
 USER_COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#56b4e9")
 USER_MARKERS = "Xhdp>"
 
@@ -351,6 +351,6 @@ def _draw_curve(
         plane.plot(cost, rmse, **dots, marker=marker, markersize=size, label=contender.title)
         plane.plot(cost, median, **dots, marker="_", markersize=7)
         if spent == EFFORT:
-            continue  # effort may rise or fall with the threshold
+            continue  # no line: effort may rise or fall with the threshold
         plane.plot(cost, rmse, color=colour, linewidth=width, zorder=above)
         plane.fill_between(cost, low, rmse + half, color=colour, alpha=0.2, linewidth=0)
