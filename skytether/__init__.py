@@ -61,7 +61,7 @@ _HOMES = {
 """Names of the library, by the module that defines them."""
 
 
-if not TYPE_CHECKING:  # hidden from type checkers, which would accept any name
+if not TYPE_CHECKING:  # hidden from type checkers, which would otherwise accept any name
 
     def __getattr__(name: str) -> Any:
         for module, names in _HOMES.items():

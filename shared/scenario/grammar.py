@@ -35,7 +35,7 @@ NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?", re.IGNORECASE | r
 
 
 class GrammarError(Exception):
-    """Error in a text: the invalid part, and the expected form."""
+    """Error in a text of a scenario. `given` is the invalid part, `expected` the expected form."""
 
     def __init__(self, given: str, expected: str) -> None:
         super().__init__(f"got {given!r}, expected {expected}")
@@ -49,7 +49,7 @@ class Call:
     values: tuple[Value, ...] = ()
     """Arguments as written; after `PluginTable` has bound the call, one value per parameter."""
     keys: tuple[str, ...] = ()
-    """Name of each argument, empty for a positional argument. After binding: empty tuple."""
+    """Name of each argument, empty for a positional argument. After binding, the tuple is empty."""
     text: str = field(default="", compare=False)
     begin: int = field(default=0, compare=False)
     """Index of the call's first character in the text."""
@@ -111,7 +111,7 @@ def leaves(expression: Expression) -> Iterator[Call]:
 
 
 def calls(text: str, form: str) -> list[Call]:
-    """Parse calls joined by & only; an empty text has no calls. The length is not limited.
+    """Parse calls joined by & only; an empty text has no calls. The text may have any length.
 
     Raises:
         GrammarError: see `parse`.

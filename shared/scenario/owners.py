@@ -14,7 +14,7 @@ import msgspec
 
 
 class Owner(Enum):
-    """Owner of a key: which end uses its value, and whether the ends may have different values."""
+    """Owner of a key: the end or ends that use the key, and whether their values may differ."""
 
     BOTH = "both ends"
     """A term of the flight: both ends predict with it, so both must have the same value."""

@@ -218,7 +218,7 @@ def _relative_to(folder: Path, raw: dict[str, Any], prefix: str = "") -> None:
 
 
 def _with_files(scenario: Scenario, source: str, checked: schema.Scenario | None) -> Scenario:
-    """Scenario with the contents of the files that it names; raises ConfigError if one cannot be
+    """Scenario with the contents of the files that it names; raises ConfigError if a file cannot be
     read.
     """
     before = _naming_files(checked) if checked else ()

@@ -440,6 +440,6 @@ IMPAIRMENTS = PluginTable(
     class_=0,
     texts=True,
 )
-"""Impairments of a direction of the network: classes. See `netem.impairments`."""
+"""Impairments of a direction of the network. Each is a class, see `netem.impairments`."""
 PLUGIN_TABLES = (SCHEMES, PLANNERS, TRIGGERS, REFERENCES, VEHICLES, IMPAIRMENTS)
 """Tables to which plug-ins can add entries."""

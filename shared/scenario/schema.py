@@ -72,7 +72,7 @@ TopicName = Annotated[str, Meta(max_length=200, pattern=r"^(/[A-Za-z_][A-Za-z0-9
 
 
 SHAPE_CHARS = 15
-"""Number of characters of a plug-in's shape that precede the digest in the terms."""
+"""Number of characters of the text of a plug-in's shape that precede the digest in the terms."""
 
 
 Contradiction = tuple[str, object, str]
@@ -137,7 +137,7 @@ class ControlConfig(Section, frozen=True):
     horizon: Term[Annotated[int, Meta(ge=1, le=INPUTS_MAX)]] = 80
     """Number of steps planned ahead, H."""
     scheme: Term[Text] = "trajectory"
-    """Delay compensation, see `skytether list schemes`."""
+    """Scheme of delay compensation, see `skytether list schemes`."""
     feedback: Term[bool] = True
     """Whether the vehicle corrects deviations from a horizon's states. A vehicle that can only play
     back inputs needs false, and `input_weight` 3, as in the scenario `playback`."""
@@ -157,7 +157,8 @@ class ControlConfig(Section, frozen=True):
     solver: OfServer[Literal["exact", "osqp"]] = "exact"
     """Solver of eq. (9): a Riccati active set (exact and fast), or OSQP for comparison."""
     spline_error_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.01
-    """Largest distance of a sent spline from the trajectory, if 16 knots suffice [m]."""
+    """Largest distance of a sent spline from the planned trajectory [m]; more if 16 knots are too
+    few."""
     state_weight: OfServer[tuple[Amount, Amount]] = (7.0, 1.0)
     """Weight Q of eq. (5) on position [1/m²] and velocity [s²/m²] of every axis."""
     terminal_weight: OfServer[tuple[Amount, Amount]] = (50.0, 20.0)
@@ -187,10 +188,11 @@ class ReferenceConfig(Section, frozen=True):
     agility: OfServer[Strength] = 0.3
     """Strength of the white acceleration of a target [m/s per √s]."""
     turn_every_s: OfServer[Duration] = 0.0
-    """Mean time between turns of a target [s]; 0: its velocity changes all the time."""
+    """Mean time between turns of a target [s]; 0: the target's velocity changes all the time."""
     noise_m: OfServer[Annotated[float, Meta(ge=0, le=1e3)]] = 0.0
-    """Standard deviation of the server's measurement of a target's position at every step [m], from
-    which the server estimates position and velocity. 0: the server knows both exactly."""
+    """Standard deviation of the server's measurements of a target's position, one at every step
+    [m]. The server estimates position and velocity from the measurements. 0: the server knows both
+    exactly."""
     radius_m: Term[Annotated[float, Meta(ge=1e-3, le=shapes.FAR_M)]] = 1.55
     """Half the width of the shape, or of a target's area [m]."""
     period_s: Term[Annotated[float, Meta(ge=0.1, le=86400)]] = 27.5
@@ -202,19 +204,19 @@ class ReferenceConfig(Section, frozen=True):
     ] = ()
     """Waypoints, the point to hover at, or the start of a live point [m]."""
     velocity_mps: Annotated[tuple[Speed, ...], Key(Owner.SERVER, InFlight.POINT)] = ()
-    """Velocity of a live point [m/s]; default: estimated from its moves."""
+    """Velocity of a live point [m/s]; default: estimated from the point's moves."""
     speed_mps: Term[Factor] = 1.0
     """Speed between waypoints, and between the places of a file without times; largest speed of a
     target along an axis [m/s]."""
     loop: Term[bool] = False
     """Whether the waypoints are repeated."""
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
-    """File with the points and their times, see docs/vehicles.md: CSV with the columns t, x, y (and
-    z), for a mission also vehicle, or one of the formats in docs/together.md; relative to the
+    """File with the points and their times: CSV with the columns t, x, y (and z), for a mission
+    also vehicle (docs/vehicles.md), or a format in docs/together.md. Its path is relative to the
     scenario's folder."""
     origin: OfEach[tuple[Position, ...]] = ()
     """Latitude and longitude of the scenario's origin [degrees], and its altitude above the sea [m]
-    for files with such altitudes; default: the origin in the file, if the file has one."""
+    for files with altitudes above the sea; default: the file's own origin, if the file has one."""
 
 
 class VehicleConfig(Section, frozen=True):
@@ -255,7 +257,7 @@ class VehicleConfig(Section, frozen=True):
     dead_time_s: OfVehicle[TrueDeadTime | tuple[TrueDeadTime, ...]] = ()
     """True dead time before an input takes effect [s]; default: the model's."""
     start_m: OfVehicle[tuple[Position, ...]] = ()
-    """Position at the start, at rest [m]; default: that of the reference."""
+    """Position at the start, at rest [m]; default: the reference's position."""
     wind: OfWind[Strength] = 0.0
     """Strength of random wind, a white acceleration [m/s per √s]."""
     steady_wind_mps: OfWind[tuple[Speed, ...]] = ()
@@ -270,7 +272,7 @@ class VehicleConfig(Section, frozen=True):
     gust_s: OfWind[MeanTime] = 1.0
     """Mean length of a gust [s]."""
     frame: OfVehicle[Literal["auto", "crazyflie", "1.5kg", "sih"]] = "auto"
-    """Frame of a quadrotor, see docs/vehicles.md; auto: 1.5kg, or that of the autopilot's
+    """Frame of a quadrotor, see docs/vehicles.md; auto: 1.5kg, or the frame of the autopilot's own
     simulator."""
     battery: OfVehicle[Annotated[float, Meta(ge=0, le=1)] | Literal["endless"]] = 1.0
     """Charge of a quadrotor's battery at the start, from 0 to 1; endless: always full."""
@@ -319,8 +321,8 @@ class NetworkConfig(Section, frozen=True):
     """Largest UDP payload that is delivered [B]; 1472 fills an Ethernet frame."""
     paths: OfEach[Annotated[tuple[PathConfig, ...], Meta(max_length=PATHS_MAX)]] = ()
     """Paths of the session, each a separate network, see docs/network.md: tables with `uplink`,
-    `downlink` (default: those above) and `price`, the price of a packet relative to the other paths
-    (more than 0, default 1). They replace `uplink` and `downlink`."""
+    `downlink` (default: those of `network`) and `price`, the price of a packet relative to the
+    other paths (more than 0, default 1). The paths replace `uplink` and `downlink` of `network`."""
 
 
 class LinkConfig(Section, frozen=True):
@@ -330,8 +332,8 @@ class LinkConfig(Section, frozen=True):
     """Longest silence allowed to the other end [s]; auto: from this end's `timeout_s` and the
     measured loss."""
     age_max_s: Term[Annotated[float, Meta(gt=0, le=60)]] = 5.0
-    """Largest age of the observation from which an input was computed [s]; after that the vehicle
-    acts as at the end of a horizon (`vehicle.exhausted`)."""
+    """Largest age of the observation from which an input was computed [s]; beyond this age the
+    vehicle acts as at the end of a horizon (`vehicle.exhausted`)."""
     join_s: Term[Annotated[float, Meta(ge=0, le=10)]] = 0.0
     """Time after a trajectory's first knot for which the vehicle accepts the trajectory [s]; 0:
     always. With a limit the server knows which trajectory the vehicle flies."""
@@ -348,8 +350,8 @@ class LinkConfig(Section, frozen=True):
     """Choice of paths for a message. auto: the paths with the least expected cost, see
     docs/protocol.md; best: the best single path; all: every path."""
     connect_s: OfVehicle[Interval] = 120.0
-    """Longest wait of the vehicle for its first session [s]; a new server compiles for up to a
-    minute."""
+    """Longest wait of the vehicle for its first session [s]; a server that was just started
+    compiles for up to a minute."""
 
     @property
     def fixed_ns(self) -> int | None:
@@ -397,7 +399,7 @@ class Scenario(Section, frozen=True):
     seed: OfEach[Annotated[int, Meta(ge=0, le=2**32 - 1)]] = 1
     """Seed of all random numbers of the flight."""
     armed: Annotated[bool, Key(Owner.VEHICLE, InFlight.ARMED)] = True
-    """Whether plans may be flown; disarmed, the vehicle brakes and stays."""
+    """Whether the vehicle may fly plans; if not, the vehicle brakes and holds its position."""
     model: ModelConfig = ModelConfig()
     control: ControlConfig = ControlConfig()
     reference: ReferenceConfig = ReferenceConfig()
@@ -584,9 +586,7 @@ class Scenario(Section, frozen=True):
         return digest(self.table + repr(origin).encode() if self.table and origin else self.table)
 
     def _shape(self) -> str:
-        """Shape as a term of the flight: the shape's name; for a plug-in's shape, its text and a
-        digest of its states.
-        """
+        """Shape as a term: its name; for a plug-in's shape, its text and a digest of its states."""
         shape = REFERENCES.one(self.reference.shape)
         if REFERENCES[shape.name].is_ours:
             return shape.name

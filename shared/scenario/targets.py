@@ -11,8 +11,8 @@ from skytether.shared.scenario.schema import Scenario
 GRID_S = 0.05
 """Time between random velocities of a target [s]; between them the velocity changes linearly."""
 TURN_S = 3600.0
-"""Time after which a target follows its path backwards, then forwards again [s]. It bounds the
-memory for the random walk."""
+"""Time after which a target follows its path backwards, then forwards again [s]. The turn bounds
+the memory for the random walk."""
 GRID_BLOCK = 1024
 GAINS_MAX = 10_000
 """Largest number of steps until the gains of a filter count as steady."""
@@ -92,9 +92,9 @@ class _Walk:
 class Measured:
     """States of a target as estimated from its positions, measured with noise at every step.
 
-    A Kalman filter estimates them, with the steady gains K for white acceleration: it predicts one
-    step at constant velocity, then x ← x + K (z - p). A state between two steps is predicted from
-    the earlier step. At time 0 the target is known to be at rest.
+    A Kalman filter with the steady gains K for white acceleration estimates the states: it predicts
+    one step at constant velocity, then x ← x + K (z - p). A state between two steps is predicted
+    from the earlier step. At time 0 the target is known to be at rest.
 
     Args:
         target: true states.

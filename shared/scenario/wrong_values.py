@@ -55,7 +55,7 @@ def explain(message: str, raw: Mapping[str, Any], scenario: type[Any]) -> str:
 
 
 def _unknown_key(table: object, section: Any, at: str = "") -> str | None:
-    """Message about the first unknown key of a table; None if all are known."""
+    """Message about the first unknown key of a table; None if all keys are known."""
     if isinstance(table, list | tuple) and typing.get_origin(section) is tuple:
         section = typing.get_args(section)[0]
         each = (_unknown_key(one, section, f"{at[:-1]}[{i}].") for i, one in enumerate(table))

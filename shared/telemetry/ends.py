@@ -18,12 +18,12 @@ COLUMNS: np.dtype[np.void] = np.dtype(
     [
         ("end", "<u1"),  # an `End`
         ("happened", "<u1"),  # a `Happened`
-        ("kind", "<u1"),  # type of the message, see docs/protocol.md; 0: encrypted, or a wake
-        ("peer", "<u2"),  # number of the other address, in the order of first packets
+        ("kind", "<u1"),  # type of the message, see docs/protocol.md; 0 if encrypted, or for a wake
+        ("peer", "<u2"),  # number of the peer's address, in the order of first packets
         ("bytes", "<u2"),  # size of the UDP payload
         ("packet", "<i8"),  # hash of the payload, the same at both ends
         ("time_ns", "<i8"),  # time of the row, on the clock of the process
-        ("due_ns", "<i8"),  # time for which the timer of a wake was set [same clock]; else 0
+        ("due_ns", "<i8"),  # time for which a wake's timer was set [same clock]; 0 in other rows
     ]
 )
 """Columns of the part: a row for each wake and each datagram, except an autopilot's datagrams."""

@@ -28,7 +28,7 @@ class FeedError(ValueError):
 
 
 class Opened(msgspec.Struct, frozen=True, tag=True, kw_only=True, omit_defaults=True):
-    """First frame of a feed: the process, and its scenario."""
+    """First frame of a feed. It describes the process and the scenario."""
 
     process: str
     """Name of the process: server, netem or client; `server.N` is worker N of a server."""

@@ -102,11 +102,11 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("measured", "<f8", (axes, 2)),  # measured since the last step [m, m/s], or NaN
             ("estimate", "<f8", (axes, 2)),  # state used by feedback and observations [m, m/s]
             ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
-            ("covered", "?"),  # whether the input is from a horizon: not when hovering or braking
+            ("covered", "?"),  # whether the input is from a horizon, not from hovering or braking
             ("in_force", "<i8"),  # step for which the horizon in force was made; -1: no horizon
-            ("age_ns", "<i8"),  # age of the observation of the horizon in force; -1: no horizon
-            ("stale", "<i8"),  # horizons so far that arrived after a newer horizon
-            ("missed", "<i8"),  # missed steps so far
+            ("age_ns", "<i8"),  # age of the horizon's observation; -1: no horizon in force
+            ("stale", "<i8"),  # number of horizons so far that arrived after a newer one
+            ("missed", "<i8"),  # number of missed steps so far
             ("mode", "<u1"),  # mode from this step on, a `shared.wire.protocol.Mode`
             ("reason", "<u1"),  # reason for the mode, a `Reason`
         ]
@@ -123,7 +123,7 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
         [
             ("vehicle", "<u2"),
             ("step", "<i8"),
-            ("reference", "<f8", (axes, 2)),  # desired state x_d(k) as known then [m, m/s]
+            ("reference", "<f8", (axes, 2)),  # desired state x_d(k) as known at this tick [m, m/s]
             ("estimate", "<f8", (axes, 2)),  # estimated state x̂(k) [m, m/s]
             ("ahead", "<i8"),  # delay bound d: planning starts at k + d
             ("planned", "<f8", (axes, 2)),  # planned state x_p(k+d|k-1) [m, m/s]
@@ -133,13 +133,13 @@ def server_columns(axes: int, scheme: str) -> np.dtype[np.void]:
             # expected_gap also without a trigger that needs it
             *((figure, "<f8") for figure in properties(scheme).figures),
             (str(Compared.OWN), "<f8"),  # figure of a plug-in's policy, in its own unit, or NaN
-            ("threshold", "<f8"),  # threshold of the compared figure, or 0
+            ("threshold", "<f8"),  # threshold of the compared figure; 0 without a threshold
             ("compared", "<u1"),  # figure compared with the threshold, a `Compared`
             ("event", "?"),
             ("solved", "?"),
             ("solve_ns", "<i8"),  # time of both MPCs for all vehicles; -1 if not measured
-            ("stale", "<i8"),  # observations so far that arrived after a newer observation
-            ("missed", "<i8"),  # missed ticks so far
+            ("stale", "<i8"),  # number of observations so far that arrived after a newer one
+            ("missed", "<i8"),  # number of missed ticks so far
         ]
     )
 

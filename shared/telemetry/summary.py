@@ -57,13 +57,13 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     """Share of the server's steps at which a horizon was sent."""
     uplink_horizons: int | None = None
     """Number of packets with a horizon that the server sent; the other uplink packets are
-    heartbeats and the handshake's."""
+    heartbeats and packets of the handshake."""
     uplink_above: int | None = None
     """Number of horizons sent because of the trigger's figure, see `telemetry.sent.SentBy`."""
     uplink_due: int | None = None
-    """Number of horizons sent because they were due by time."""
+    """Number of horizons sent as a heartbeat, by a schedule, or as the first plan."""
     uplink_packets: int | None
-    """Number of packets that entered the network from the server, including lost ones."""
+    """Number of packets that entered the network from the server, including lost packets."""
     uplink_bytes: int | None
     """UDP payload of all uplink packets [B]."""
     downlink_packets: int | None
@@ -71,7 +71,7 @@ class Summary(msgspec.Struct, frozen=True, kw_only=True):
     paths: list[tuple[int, int]] | None = None
     """Number of uplink and downlink packets on each path; None with a single path."""
     uplink_packets_per_s: float | None = None
-    """Rate of packets from the server, including heartbeats and lost ones [1/s]."""
+    """Rate of packets from the server, including heartbeats and lost packets [1/s]."""
     uplink_bytes_per_s: float | None = None
     """Data rate of the packets from the server, with HEADER_BYTES per packet [B/s]."""
     downlink_packets_per_s: float | None = None
@@ -143,7 +143,7 @@ def summarise(
         name: name of the scenario.
         client: rows of the vehicle in the client's part.
         server: rows of the server, of any vehicles.
-        netem: rows of netem; all flows count.
+        netem: rows of netem, of all flows.
         figures: figures of each process by its name, as in `Record.figures`.
         secure: whether the link was authenticated and encrypted.
     """

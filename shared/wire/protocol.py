@@ -130,7 +130,7 @@ class Mode(IntEnum):
 
 
 class Observation(NamedTuple):
-    """The vehicle's state at the start of a step, and the input flown from there on."""
+    """The vehicle's state at the start of a step, and the input flown from this step on."""
 
     vehicle: int
     session: int
@@ -196,7 +196,7 @@ class Trajectory(NamedTuple):
 
 
 class Idle(IntEnum):
-    """Reason why the server sends no plan. PLANS: the server plans, and the trigger decides."""
+    """Reason why the server sends no plan. PLANS: it plans, and the trigger may send the plan."""
 
     def __new__(cls, number: int, text: str = "") -> "Idle":
         made = int.__new__(cls, number)
@@ -308,7 +308,7 @@ def _checked(values: list[object], checks: tuple[Check, ...], terms: Terms) -> l
 
 
 def _terms(value: object, ours: Terms) -> Terms:
-    """The peer's terms; values may differ from ours, types must not."""
+    """The peer's terms. Their values may differ from ours, but their types must not."""
     if type(value) is not tuple or len(value) != len(ours):
         raise ProtocolError(Drop.FIELD)
     for theirs, our in zip(value, ours, strict=True):
@@ -432,9 +432,9 @@ _TYPES: dict[int, tuple[type[Any], tuple[Check, ...]]] = {
     7: (Trajectory, (U16, U32, U32, _STAMP, _AGE, _SPACING, knots_in, _NUMBER, U16)),
     8: (Time, (U16, U32, U32, _STAMP, U32)),
 }
-"""Class of the message with each type number (from 1), and a check for each of its fields."""
+"""Message class of each type number (from 1), and a check for each of the message's fields."""
 _ROOMS = {9: "skytether.shared.wire.path_proof", 10: "skytether.shared.wire.lead"}
-"""Modules with optional messages, by type number, imported with the first such message."""
+"""Modules of optional messages, by type number; imported when such a message first occurs."""
 
 _OBSERVATION = 3
 """Type number of the message that a server receives most."""

@@ -54,7 +54,7 @@ TRUTH_COLUMNS: np.dtype[np.void] = np.dtype(
 
 PILOTS: dict[FlavourName, type[PilotedVehicle]] = {"ardupilot": ArduPilot, "px4": PX4}
 POSITION_IGNORED, VELOCITY_IGNORED = 0b111, 0b111000
-"""Bits of a set-point's type mask that mean: ignore position, ignore velocity."""
+"""Bits of a set-point's type mask: ignore the position, and ignore the velocity."""
 ACCELERATION_IGNORED = 0b111000000
 
 

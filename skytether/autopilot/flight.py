@@ -291,7 +291,7 @@ class PilotedVehicle(ABC):
 
     @abstractmethod
     def enter_takeoff(self) -> bool:
-        """Enter the mode that climbs; returns whether this is possible."""
+        """Enter the mode in which the vehicle climbs; returns whether this is possible."""
 
     @abstractmethod
     def limits(self) -> OwnSpeeds: ...

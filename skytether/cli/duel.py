@@ -44,7 +44,7 @@ class DuelOptions:
     virtual: bool = False
     """Fly in virtual time; the page shows the flights afterwards, until Ctrl-C."""
     page: str = HOST_PORT
-    """HOST:PORT to serve the page on; if the port is taken, the next free one."""
+    """HOST:PORT to serve the page on; if the port is taken, the next free port."""
     plugin: command.Plugins = ()
 
 

@@ -133,7 +133,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     netem_cpu_us: float | None
     """CPU time of netem per packet [µs]."""
     vehicle_steps_per_core_s: float | None
-    """Vehicle steps flown per second of CPU time of all parts [1/s]; in virtual time only."""
+    """Number of vehicle steps flown per second of total CPU time [1/s]; in virtual time only."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -80,7 +80,7 @@ class FlyOptions(ScenarioOptions):
     """
     page: str | None = None
     """HOST:PORT of the page that shows and controls the flight, by default SKYTETHER_PAGE or
-    127.0.0.1:8080; if the port is taken, the next free one. Visitors from other machines need the
+    127.0.0.1:8080; if the port is taken, the next free port. Visitors from other machines need the
     printed token to change anything. Not in virtual time: see `skytether replay`.
     """
     no_page: bool = False

@@ -19,7 +19,7 @@ from skytether.view.recordings.joining import join as joined
 class JoinOptions:
     files: Annotated[tuple[Path, ...], Argument(positional=True, metavar="FILE")]
     """Recordings (.mcap), one from each process; or the single recording of a killed flight, to
-    which `join` adds the end that other programs expect.
+    which `join` adds the footer that other programs need.
     """
     record: Path
     """File for the recording of the flight (.mcap)."""

@@ -26,7 +26,7 @@ from skytether.view.frames import of_flight
 from skytether.view.recordings.recording import About, Recording
 
 FLUSH_S = 0.25
-"""Interval at which new frames are written [s]. If killed, a process loses the last interval."""
+"""Interval at which new frames are written [s]. A killed process loses the last interval."""
 PATIENCE_S = 3.0
 """Longest time to wait at the end for the rest of the feeds [s]."""
 

@@ -29,7 +29,7 @@ class ReplayOptions:
     file: Annotated[Path, Argument(positional=True, metavar="FILE")]
     """The recording (.mcap), as written by `fly --record`."""
     page: str = HOST_PORT
-    """HOST:PORT to serve the page on; if the port is taken, the next free one."""
+    """HOST:PORT to serve the page on; if the port is taken, the next free port."""
     plugin: command.Plugins = ()
 
 

@@ -27,7 +27,7 @@ class ReportOptions:
     html: Path = Path("report.html")
     """File for the HTML page."""
     explain: bool = False
-    """Begin with the output of `skytether explain`; not for missions over UDP."""
+    """Begin the page with the output of `skytether explain`; not for missions over UDP."""
     plugin: command.Plugins = ()
 
 

@@ -62,7 +62,7 @@ class Unmet:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """Property of the scenario, such as wind, that changed values of keys remove."""
+    """Property of the scenario, such as wind, that can be removed by changing keys."""
 
     name: str
     keys: Keys
@@ -74,9 +74,9 @@ class Stall:
 
     process: Literal["server", "client"]
     at_s: float
-    """Time of flight at the beginning [s]."""
+    """Time of flight at the stall's beginning [s]."""
     for_s: float
-    """Length [s]; infinite if the process is killed."""
+    """Length of the stall [s]; infinite if the process is killed."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,9 +48,9 @@ class CausePart:
     is_needed: bool
     """Whether the moment does not occur without this unit."""
     error_m: float
-    """Largest error without this unit [m]."""
+    """Largest error in the flight without this unit [m]."""
     calm_m: float = np.nan
-    """Largest error without this unit, wind and model errors [m]; only for a real vehicle."""
+    """Largest error without this unit, wind and model errors [m]; for a real vehicle only."""
     packets: int = 0
     """Number of packets that the unit lost or delayed."""
     plans: int = 0
@@ -70,7 +70,7 @@ class Cause:
     among: int
     """Number of units that were examined."""
     error_m: float
-    """Largest error with this cause alone [m]."""
+    """Largest error in the flight with this cause alone [m]."""
     averting: tuple[CausePart, ...] = ()
     """Smallest set without which the moment does not occur; empty if `parts` is such a set."""
     others: tuple[CausePart, ...] = ()
@@ -141,7 +141,7 @@ def cause(
 
 
 def _in_order(found: Sequence[Unit]) -> list[Unit]:
-    """Units of a set, sorted so that single packets, of which there may be many, come last."""
+    """Units of a set, sorted so that single packets come last: there may be many of them."""
     return sorted(found, key=lambda each: isinstance(each, Bad) and each.is_packet)
 
 

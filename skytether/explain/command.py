@@ -42,9 +42,9 @@ class ExplainOptions:
     """Number of further seeds with which each remedy is flown: those after the scenario's seed."""
     vehicles: Annotated[int | None, Argument(metavar="N")] = None
     """Number of vehicles, as in `skytether fleet`; by default one, or all vehicles of a mission. A
-    recording has its own number."""
+    recording has the number of its flight."""
     json: Path | None = None
-    """JSON file for the explanation, written again after each of its steps."""
+    """File for the explanation as JSON, rewritten after each step of the explanation."""
     figure: Path | None = None
     """File for a picture of the explanation (.png, .pdf or .svg)."""
     pool: PoolFlags = Flags()
@@ -176,7 +176,7 @@ def _explain(options: ExplainOptions, name: str, case: FlightCase, recorded: str
                 if isinstance(recorded, str):
                     check_same(known.flown, recorded or known.flown.trace, options.scenario)
                 flyers.advance(1, step)
-                if options.json is not None:  # each time, for programs that show the progress
+                if options.json is not None:  # at each step, for programs that show the progress
                     command.write(options.json, known.to_json(step))
         except Interrupted as error:
             interrupted = error

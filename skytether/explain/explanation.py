@@ -53,7 +53,7 @@ class Explanation:
         return f"{said}\n\n{of_mission}" if (of_mission := self.flown.judgement) else said
 
     def to_json(self, following: str = "") -> bytes:
-        """The explanation so far as JSON: its fields without flights. Further fields are a
+        """The explanation so far as JSON: all its fields except flights. Further fields are a
         mission's judgement, the text, and `next`: name of the next step, empty at the end.
         """
         names = "name", "seed", "moments", "moment", "nearness", "cause", "rescues", "remedies"
@@ -143,8 +143,8 @@ def _chosen(
         raise ConfigError(f"at: got {at_s:g}, expected {expected}{because}")
 
     def order(each: Moment) -> tuple[float, float, int]:
-        # Times are printed in tenths of a second; of several moments near a printed time, take the
-        # moment that begins at that time.
+        # Times are printed in tenths of a second. If several moments are near a printed time, take
+        # the moment that begins then.
         return round(distance_s(each), 1), round(abs(each.start_s - at_s), 1), -WEIGHTS[each.kind]
 
     return min(near, key=order)

@@ -1,4 +1,4 @@
-"""Moments: what went wrong in a flight, in comparison with a perfect one.
+"""Moments: what went wrong in a flight, in comparison with a perfect flight.
 
     failure      a vehicle could not fly, or not to the end
     brake        a vehicle brakes, lands or stands still, until it follows a plan again

@@ -39,7 +39,7 @@ class Elsewhere:
 
 @dataclass(frozen=True, slots=True)
 class Remedy:
-    """Other keys, and results of the flight with them."""
+    """Keys of a remedy, and results of the flight with these keys."""
 
     name: str
     keys: Keys

@@ -78,8 +78,8 @@ PUSH = Setting("wind and errors of the model", (("vehicle.kind", "doubled(0)"),)
 
 
 def perfect(case: FlightCase) -> FlightCase:
-    """Case in which every packet arrives without delay and nothing else is wrong; its wind is the
-    same, without gusts.
+    """Case in which every packet arrives without delay and nothing else is wrong; the wind is that
+    of the flight, without gusts.
     """
     network, none = case.scenario.network, {"uplink": "none", "downlink": "none"}
     paths = tuple(msgspec.structs.replace(each, **none) for each in network.paths)

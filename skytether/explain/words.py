@@ -171,7 +171,7 @@ def _rescued(rescues: Rescues) -> str:
 
 
 def _off(error_m: float, sign: str = "") -> str:
-    """Error in brackets [m]; empty without an error (NaN), because no step was flown."""
+    """Error in brackets [m]; empty for NaN, which means that no step was flown."""
     return "" if math.isnan(error_m) else f" ({error_m:{sign}.2f} m)"
 
 

@@ -1,4 +1,4 @@
-"""Gymnasium environments behind a bad network: `Networked`, and `NetworkedVector` for many.
+"""Gymnasium environments behind a bad network: `Networked`, and `NetworkedVector` for many robots.
 
 Robot and environment are at one end, the agent at the other. Time is virtual: step k of the
 environment begins k · `step_s` after the episode's start, and nothing sleeps. At each step a robot
@@ -48,8 +48,8 @@ MTU = 1472
 KEY = "network"
 """Key of `info` with all entries about the network."""
 Answer = Any
-"""One action; arrays of actions for successive steps along a first axis, beginning at the step of
-the newest observation; a `Chunk` of actions; or None, which sends nothing."""
+"""Answer of an agent: one action; an array of actions for successive steps along the first axis,
+from the step of the newest observation on; a `Chunk` of actions; or None, which sends nothing."""
 Exhausted = Literal["hold", "zero"] | Callable[[Any, Any], Any]
 """Rule after the last received action: repeat that action ("hold"), execute `idle` ("zero"), or
 call a function that returns an action from the robot's observation and its last action (None before
@@ -211,7 +211,7 @@ class _Far:
         return Chunk(rows, first, thought_ns)
 
     def thought_ns(self, *, is_nothing: bool) -> int:
-        """Thinking time of an answer [ns], measured or drawn; a drawn time is 0 without answer."""
+        """Thinking time of an answer [ns], measured or drawn; 0 if it is drawn for no answer."""
         if self.thinking is None:
             return self._clock_ns() - self._returned_ns
         if is_nothing:

@@ -46,7 +46,7 @@ class CalibrateOptions:
     """Number of flights of each point (with table1: for each column of the table); seeds count up
     from --seed."""
     generations: int = 40
-    """Number of generations; a search in OUT continues up to this number."""
+    """Number of generations; an earlier search in OUT continues up to this number."""
     population: int = 10
     """Number of points in a generation."""
     sigma: float = SIGMA

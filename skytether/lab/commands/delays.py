@@ -53,7 +53,7 @@ class _End(asyncio.DatagramProtocol):
 def measure(
     scenario: Scenario, folder: Path, packets: int, on_second: Callable[[float], None]
 ) -> Array:
-    """Send packets through netem in one direction, and an answer for each in the other.
+    """Send packets through netem in one direction, and an answer to each packet in the other.
 
     Args:
         folder: folder for the scenario file that netem reads, and for netem's record.

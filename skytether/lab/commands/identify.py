@@ -58,8 +58,8 @@ class IdentifyOptions:
     """Vehicle to fly (`skytether list vehicles`), in place of `vehicle.kind`. Kinds with real
     hardware, such as mavlink, fly in real time; others fly in virtual time."""
     scenario: str = "demo"
-    """Scenario to be flown later: a name (`skytether list scenarios`) or a .toml file. The
-    written scenario extends it."""
+    """Scenario to be flown later: a name (`skytether list scenarios`) or a .toml file. The scenario
+    that is written extends this scenario."""
     speed: Annotated[tuple[float, ...], Argument(metavar="MPS")] = ()
     """Size of the velocity steps [m/s], one number for all axes or one for each axis. By default
     the reference's largest speed on the axis, but at least half of its largest speed on any axis.

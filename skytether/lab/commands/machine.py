@@ -19,7 +19,7 @@ def processor() -> str:
 def commit() -> str | None:
     """Commit of the checkout from which this code runs; None without a checkout.
 
-    Cached, because a benchmark may write results to the checkout, which is then marked as modified.
+    The result is cached: a benchmark may modify the checkout by writing its results there.
     """
     command = ["git", "describe", "--always", "--abbrev=12", "--dirty", "--exclude=*"]
     here = Path(__file__).parent

@@ -1,4 +1,4 @@
-"""`skytether margins`: stability of a scenario's loop, and for which vehicles it is stable."""
+"""`skytether margins`: stability of a scenario's loop, and the vehicles for which it is stable."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -153,7 +153,7 @@ class Crew:
         return {key: results[key] for key in cells}
 
     def map(self, fly: Callable[[T], R], items: Sequence[T]) -> list[R]:
-        """Results of a function for all items, in order; the progress bar does not count them."""
+        """Results of a function for all items, in order. The progress bar counts no items."""
         return list(self.study(fly, dict(enumerate(items)), size=lambda _: 0.0).values())
 
     def sweep(self, plan: Sweep, out: Path, text: str = "") -> Results:
@@ -244,7 +244,7 @@ def study(
     title: str = "flying",
     unit: str = "flights",
 ) -> list[R]:
-    """Fly a study that is a whole command; returns the results in order, see `Crew.study`.
+    """Fly the only study of a command; returns the results in order, see `Crew.study`.
 
     Args:
         cells: items to fly, which are also the keys in the journal; a later call may add items.

@@ -53,8 +53,9 @@ def reproduce(argv: Sequence[str]) -> None:
     """Reproduce the paper's Table 1 and Figures 2 to 5, and fly further usual studies.
 
     OUT/report.html has all results, and opens offline; every figure is in OUT as PNG, PDF and CSV.
-    The report shows flights over UDP beside those in virtual time. All are stored: after Ctrl-C
-    or a crash, the same command continues; after the last flight, it only redraws the report.
+    The report shows flights over UDP beside those in virtual time. All flights are stored: after
+    Ctrl-C or a crash, the same command continues; after the last flight, it only redraws the
+    report.
     """
     options = read(ReproduceOptions(), argv, "skytether reproduce", reproduce.__doc__)
     command.check_count("--runs", options.runs, 100_000)

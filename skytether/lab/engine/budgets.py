@@ -202,7 +202,7 @@ class Plan:
         the other does not.
 
         A pair is skipped unless the point above the budget has a smaller error than the best point
-        within it.
+        within the budget.
         """
         best, points_between = self._best(), {}
         ways: dict[tuple[str, str], list[Scouted]] = {}

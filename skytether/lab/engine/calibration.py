@@ -39,7 +39,7 @@ TABLE_1: Mapping[str, Mapping[str, float]] = {
 """Entries of the paper's Table 1: errors [m], and the event ratio ("10 times smaller")."""
 
 TOLERANCE = 0.1
-"""An entry counts as reproduced up to this relative deviation, an event ratio up to twice this."""
+"""Relative deviation up to which an entry counts as reproduced; twice that for event ratios."""
 UNFLYABLE = 1e9
 """Score of a point if one of its flights failed."""
 

@@ -151,7 +151,7 @@ RUNS = 4
 
 
 class Floor(msgspec.Struct, frozen=True):
-    """Floor of the RMSE at one rate of packets, which are sent at fixed times."""
+    """Floor of the RMSE for packets that are sent at fixed times, at one rate."""
 
     packets_per_s: float
     rmse_m: float

@@ -52,11 +52,9 @@ SETTLE_S, ROUND_TRIPS = 5.0, 4.0
 sessions are open and the delay bound is stationary.
 """
 WIND_S, WIND_BUILDS_S = 60.0, 10.0
-"""Time for which the response to wind is evaluated, and time before that in which it builds up [s].
-"""
+"""Time for which the response to wind is evaluated, and build-up time before it [s]."""
 SMALL = 0.05
-"""A response is evaluated until an input reaches this share of its bound, so that no bound is
-active."""
+"""A response is evaluated until an input reaches this share of its bound: no bound is active."""
 STEPS_MIN = 10
 """Smallest number of steps from which a growth can be estimated."""
 WIND_ALONE = 0.1

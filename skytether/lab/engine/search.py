@@ -172,8 +172,7 @@ class SearchPoint:
 Point = tuple[float, ...]
 """Values of the free keys, in order; they identify a point in the journal."""
 FlyAll = Callable[[Mapping[Point, Scenario]], Mapping[Point, Values]]
-"""Function that returns the figures of scenarios, after flying the scenarios without stored
-figures."""
+"""Function that flies scenarios without stored figures, and returns the figures of all."""
 
 
 @dataclass(frozen=True, slots=True)

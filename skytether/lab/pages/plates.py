@@ -70,7 +70,7 @@ def picture(figure: "Figure", name: str, title: str, says: str, csv: str) -> Pla
 
 
 def delay(direction: str, delay_ms: Array) -> Plate:
-    """Fig. 2: distribution of the delay (17), drawn and measured.
+    """Fig. 2: distribution of the delay, eq. (17), drawn and measured.
 
     `delay_ms` has the measured delay of each packet over UDP, and the delay that netem drew [ms];
     shape (packets, 2).
@@ -339,7 +339,7 @@ def against_periodic(study: Study, cells: Cells) -> tuple[int, int]:
 
 
 def estimates(samples: Samples) -> Plate:
-    """Distribution of the error of the server's state estimate (13)."""
+    """Distribution of the error of the server's state estimate, eq. (13)."""
     shares = np.linspace(0.0, 1.0, 201)
     errors = {
         method: np.concatenate([_estimate_error(flight) for flight in flights])
