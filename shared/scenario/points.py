@@ -70,7 +70,7 @@ def waypoints(points_m: Array, speed_mps: float, *, loop: bool = False) -> Refer
 
 
 def square(radius_m: float, period_s: float, axes: int, altitude_m: float = 0.0) -> Reference:
-    """Square, corners (±radius, ±radius), counter-clockwise, starting at (radius, -radius)."""
+    """Square with corners (±radius, ±radius), flown counter-clockwise from (radius, -radius)."""
     corners = np.zeros((4, axes))
     corners[:, :2] = radius_m * np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]])
     corners[:, 2:] = altitude_m

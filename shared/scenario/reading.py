@@ -299,7 +299,7 @@ def _with_texts(raw: Mapping[str, Any], source: str) -> dict[str, Any]:
 
 
 def _with_paths(raw: dict[str, Any], source: str) -> dict[str, Any]:
-    """Raw table in which every path has both directions, if necessary those of the network."""
+    """Raw table in which every path has both directions, by default those of the network."""
     network: Any = raw.get("network")
     paths = network.get("paths") if isinstance(network, Mapping) else None
     if not (isinstance(paths, list | tuple) and all(isinstance(each, Mapping) for each in paths)):

@@ -93,6 +93,6 @@ def sampled(reference: Reference, axes: int) -> bytes:
         if states.shape != shape or states.dtype.kind != "f":
             got = f"{states.dtype.name} of shape {states.shape}"
             raise ValueError(f"got {got} at {times.size} times, expected floats of shape {shape}")
-        if not (np.abs(states) <= [FAR_M, FAST_MPS]).all():  # NaN fails too
+        if not (np.abs(states) <= [FAR_M, FAST_MPS]).all():  # NaN is refused, too
             raise ValueError(f"expected at most {FAR_M:g} m from the origin, and {FAST_MPS:g} m/s")
     return np.rint(1000.0 * states).astype(np.int64).tobytes()

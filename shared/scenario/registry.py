@@ -90,7 +90,7 @@ class Parameter:
         return isinstance(value, str) or math.isfinite(value)
 
     def without_unit(self, value: Value | None) -> Value | None:
-        """Number in the parameter's own unit for a word such as 50ms; for all else the value."""
+        """Value, converted to the parameter's own unit if it is a word such as 50ms or 10%."""
         match = _WITH_UNIT.fullmatch(value) if isinstance(value, str) and not self.file else None
         units = next(units for end, units in UNITS.items() if self.name.endswith(end))
         if match is None or match[2].lower() not in units:

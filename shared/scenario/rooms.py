@@ -31,7 +31,7 @@ APART = ("swap", "sphere", "mission", "show")
 SCHEME_APART = "skytether.server.missions.planning"
 """Module of the scheme that flies the shapes of APART, in place of `control.scheme`."""
 HORIZONS = f"{SHARED}scenario.horizons"
-"""Module with the contradictions of schemes that send horizons of inputs."""
+"""Module that checks for contradictions in scenarios whose scheme sends horizons of inputs."""
 FROM_FILE = ("csv", "mission", "show")
 """Shapes that are read from `reference.file`."""
 ZONES = PluginTable(

@@ -99,7 +99,7 @@ def client_columns(axes: int) -> np.dtype[np.void]:
             ("vehicle", "<u2"),
             ("step", "<i8"),
             ("state", "<f8", (axes, 2)),  # true state [m, m/s]; of a real vehicle, the estimate
-            ("measured", "<f8", (axes, 2)),  # measured since the last step [m, m/s], or NaN
+            ("measured", "<f8", (axes, 2)),  # state measured since the last step [m, m/s], or NaN
             ("estimate", "<f8", (axes, 2)),  # state used by feedback and observations [m, m/s]
             ("input", "<f8", (axes,)),  # desired velocity that is flown from this step on [m/s]
             ("covered", "?"),  # whether the input is from a horizon, not from hovering or braking

@@ -161,7 +161,7 @@ class Autopilot(Endpoint):
         messages = self._reader.decode(datagram.payload)
         peer = self._peers.get(datagram.peer)
         for message in messages:
-            if message.get_srcSystem() == SYSTEM:  # an echo, or from a system with the same id
+            if message.get_srcSystem() == SYSTEM:  # an echo, or a message from a system with our id
                 self._counts["foreign"] += 1
                 continue
             peer = peer or self._meet(datagram.peer)

@@ -118,7 +118,7 @@ class PilotedVehicle(ABC):
         self.armed_ns: int | None = None
         self.flying = False
         self.estimates = True
-        """Whether the position estimate works. It does not during `ready_s`."""
+        """Whether the position estimate works. Until `ready_s` has passed, it is not valid."""
         self.drift: Vector = REST
         """True minus estimated velocity, as after a failure of the accelerometers [m/s]."""
         self._wander, self._noise = np.zeros(3), noise
@@ -341,7 +341,7 @@ class PilotedVehicle(ABC):
             self._settle(velocity)
 
     def once(self, failsafe: str) -> bool:
-        """Whether a failsafe is triggered for the first time in this flight; the call counts."""
+        """Note that a failsafe is triggered; returns whether it is the first time in the flight."""
         new = failsafe not in self._announced
         self._announced.add(failsafe)
         return new

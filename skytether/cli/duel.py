@@ -72,7 +72,7 @@ def duel(argv: Sequence[str]) -> None:
 
 
 def together(options: DuelOptions) -> list[Scenario]:
-    """Scenarios of a duel, all with network, duration and seed of the first."""
+    """Scenarios of a duel, all with network, duration and seed of the first scenario."""
     if len(options.scenarios) < 2:
         message = f"got {len(options.scenarios)} scenario, expected two or more"
         raise CommandError(message, command.CONFIGURATION)

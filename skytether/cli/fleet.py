@@ -99,7 +99,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     least_separation_m: float | None
     """Smallest distance between two vehicles of a mission [m]."""
     left_tube: int | None
-    """Number of observations outside a tube (`mission.tube_m`); only 0 proves the separation."""
+    """Number of observations outside a tube (`mission.tube_m`); above 0, separation is unproven."""
     uplink_packets_per_s: float
     """Rate of packets from the server into the network [1/s]."""
     downlink_packets_per_s: float
@@ -111,7 +111,7 @@ class FleetSummary(msgspec.Struct, frozen=True, kw_only=True):
     drops: dict[str, dict[str, int]]
     """Number of packets that server, netem and vehicles dropped, by reason, see `Summary.drops`."""
     plugin_errors: dict[str, int]
-    """Number of errors in the code of plug-ins, by kind, see `Summary.plugin_errors`."""
+    """Number of errors in plug-ins' code, by kind of plug-in, see `Summary.plugin_errors`."""
     tick_ms_p50: float
     """Median duration of a server's tick, all vehicles together, in the slowest worker [ms]."""
     tick_ms_p99: float

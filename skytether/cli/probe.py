@@ -101,7 +101,7 @@ class ProbeOptions:
     json: Path | None = None
     """File for all figures, as JSON."""
     figure: Path | None = None
-    """Picture of the delays, .png, .svg or .pdf."""
+    """File for a picture of the delays (.png, .svg or .pdf)."""
     record: Path | None = None
     """File for one row per packet, in netem's format."""
 
@@ -418,7 +418,7 @@ def _tell_accuracy(outcome: ProbeOutcome, of_path: str) -> None:
 
 
 def _flights(options: ProbeOptions, outcomes: Sequence[ProbeOutcome]) -> Sequence[str]:
-    """Commands that fly over the models and over the traces."""
+    """Commands with which a user can fly over the fitted models, and over the traces."""
     paths = [
         {"downlink": each.figures.downlink, "uplink": each.figures.uplink} for each in outcomes
     ]

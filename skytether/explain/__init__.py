@@ -1,4 +1,5 @@
-"""Explain: why a flight braked, was far off, came too close, or sent too much.
+"""Explain why a vehicle braked, was far off or came too close, or why the server sent too many
+plans.
 
 A flight in virtual time is the same to the last bit each time, and the loss and delay of a packet
 follow from seed, direction, flow and time. So the same flight can be flown again without an outage,

@@ -34,7 +34,7 @@ longer than two time-outs, a horizon and the delays together."""
 SHORTEST_MS = 20
 """Resolution of the bisection for the shortest outage that still causes the moment [ms]."""
 PACKETS_MAX = 64
-"""Largest number of packets, the newest, that `rescues` delivers, each in a flight of its own."""
+"""Number of newest packets that `rescues` delivers one by one, each in a flight of its own."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class CausePart:
     plans: int = 0
     """Number of plans among these packets."""
     shortest_s: tuple[float, float] | None = None
-    """Lengths of the shortest sufficient outages with the unit's beginning and with its end [s]."""
+    """Lengths of the shortest sufficient outages with the unit's beginning or end [s]; sorted."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""`skytether explain`: why a flight went as it did."""
+"""`skytether explain`: explain why a flight went wrong."""
 
 import time
 from collections.abc import Sequence
@@ -42,7 +42,7 @@ class ExplainOptions:
     """Number of further seeds with which each remedy is flown: those after the scenario's seed."""
     vehicles: Annotated[int | None, Argument(metavar="N")] = None
     """Number of vehicles, as in `skytether fleet`; by default one, or all vehicles of a mission. A
-    recording has the number of its flight."""
+    recording contains this number."""
     json: Path | None = None
     """File for the explanation as JSON, rewritten after each step of the explanation."""
     figure: Path | None = None

@@ -88,7 +88,7 @@ class Late(Steady):
 
 @impairment(name="doubled")
 class DoubledPath(Trace):
-    """Delays or loses each packet like the recorded packet with its slot and its rank there."""
+    """Delays or loses each packet like the recorded one with the same slot and rank in the slot."""
 
     def __init__(self, file: File) -> None:
         super().__init__(file, "once")

@@ -41,7 +41,7 @@ class Track:
     began_s: float
     """Time of flight at step 0 [s]."""
     step_s: Array
-    """Time since step 0 [s]."""
+    """Time of each step since step 0 [s]; shape (n,)."""
     position_m: Array
     """Position [m]; shape (n, axes)."""
     error_m: Array
@@ -51,7 +51,7 @@ class Track:
 
     @property
     def time_s(self) -> Array:
-        """Time of flight, counted as in events [s]."""
+        """Time of flight of each step, counted as in events [s]; shape (n,)."""
         return self.began_s + self.step_s
 
 
@@ -73,7 +73,7 @@ class Death(NamedTuple):
     """Decision of the vehicle or the server that a path is dead."""
 
     time_s: float
-    """Time of flight [s]."""
+    """Time of flight at the decision [s]."""
     vehicle: int
     path: int
     direction: int

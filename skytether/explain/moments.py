@@ -29,7 +29,7 @@ from skytether.shared.wire.protocol import Mode
 FAR_TIMES = 3.0
 """An error is large above this multiple of the usual error, plus `FAR_STEPS`."""
 FAR_STEPS = 2.0
-"""Margin added to the bound on errors, in steps at full speed: two steps correct it."""
+"""Margin of the bound on errors, in steps at full speed: two steps correct any smaller error."""
 AROUND_S = 1.0
 """The usual error at a step is the perfect flight's largest error within this time of it [s]."""
 AFTER_S = 5.0
@@ -39,7 +39,8 @@ PAUSE_S = 1.0
 NEAR = 1.05
 """Two vehicles are too near below this multiple of the required separation."""
 WASTED_TIMES, WASTED_PER_S = 3.0, 10.0
-"""Plans are wasted above the perfect flight's rate times this factor and plus this excess [1/s]."""
+"""Plans are wasted if their rate exceeds this multiple of the perfect flight's rate, and exceeds
+that rate by more than this [1/s]."""
 
 ALIVE = 0.5
 """A path was not dead if a larger share of its packets arrived."""
@@ -57,7 +58,7 @@ class Moment:
     vehicle: int
     """Number of the vehicle, from 1; 0 for all vehicles together."""
     start_s: float
-    """Time of flight at the beginning, counted as in events [s]."""
+    """Time of flight at the moment's beginning, counted as in events [s]."""
     end_s: float
     says: str
     """Description of the moment: a sentence without subject."""

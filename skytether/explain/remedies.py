@@ -48,7 +48,7 @@ class Remedy:
     brakes: int
     """Number of brakes, landings and faults in the whole flight."""
     error_m: float
-    """Largest error during the moment and shortly after [m]."""
+    """Largest error during the moment and shortly after it [m]."""
     packets_per_s: float
     """Packet rate of both directions [1/s]."""
     elsewhere: Elsewhere | None = None

@@ -158,7 +158,7 @@ def fleet(
         faint = 0.5 if separations else max(0.05, 1 / len(flights))
         plane.plot(x, y, "k-", linewidth=0.6, alpha=faint)
     if separations:
-        from skytether.shared.missions.derived import zones  # missions may be absent
+        from skytether.shared.missions.derived import zones  # the package of missions may be absent
 
         for number, zone in enumerate(zones(scenario).zones):
             label = "" if number else "zones"

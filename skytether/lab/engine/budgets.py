@@ -57,7 +57,7 @@ REPORTS: Mapping[str, Mapping[str, Any]] = {
 }
 """Policies for the vehicle's reports, and the keys that each policy changes."""
 EVERY = "every step"
-"""Reporting policy of the searches for weights."""
+"""Reporting policy with which the searches for weights fly."""
 ITS_OWN = "its own"
 """Name of the reporting policy that a user's contender sets itself."""
 

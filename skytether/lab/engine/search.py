@@ -181,7 +181,7 @@ class Search:
     objective: Objective
     free: Sequence[Free]
     runs: int
-    """Number of flights of each point, with seeds that count up from the start's."""
+    """Number of flights of each point, with seeds that count up from the scenario's."""
     population: int
     sigma: float = SIGMA
     """Initial step size, as a share of each key's logarithmic range."""

@@ -87,7 +87,7 @@ def values(kind: Any) -> str:
 
 
 def _either(kinds: list[str]) -> str:
-    """Allowed values of a union type, words first. A number and a list of it share one range."""
+    """Allowed values of a union type, words first. A number or list of numbers has one range."""
     if kinds[1] == f"list of numbers, {kinds[0]}":
         return f"number or {kinds[1]}"
     return " or ".join(sorted(kinds, key=lambda each: not each.startswith("`")))
