@@ -211,9 +211,9 @@ class ReferenceConfig(Section, frozen=True):
     loop: Term[bool] = False
     """Whether the waypoints are repeated."""
     file: Annotated[str, Key(Owner.BOTH, term="table")] = ""
-    """File with the points and their times: CSV with the columns t, x, y (and z), for a mission
-    also vehicle (docs/vehicles.md), or a format in docs/together.md. Its path is relative to the
-    scenario's folder."""
+    """File with the points and their times: CSV with the columns t, x, y (in space also z, on a
+    mission also vehicle), see docs/vehicles.md, or a format in docs/together.md. The path is
+    relative to the scenario's folder."""
     origin: OfEach[tuple[Position, ...]] = ()
     """Latitude and longitude of the scenario's origin [degrees], and its altitude above the sea [m]
     for files with altitudes above the sea; default: the file's own origin, if the file has one."""

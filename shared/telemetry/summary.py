@@ -223,7 +223,7 @@ PLUGINS = ("trigger", "planner", "scheme")
 
 
 def plugin_errors(figures: Mapping[str, Any]) -> dict[str, int]:
-    """Number of failures of a plug-in's code, by its kind; empty if there was none."""
+    """Number of failures of a plug-in's code, by kind of plug-in; empty if no code failed."""
     found = Counter[str]()
     for process, reported in figures.items():
         if process.startswith("server"):

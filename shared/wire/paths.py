@@ -487,8 +487,8 @@ class Paths:
                 be from a new run of the other end, whose numbers begin anew.
 
         Raises:
-            ProtocolError: the report has another number of paths than this session; or it is older
-                than WINDOW packets and `is_recent` is False.
+            ProtocolError: the report has another number of paths than this session; or the report
+                is older than WINDOW packets and `is_recent` is False.
         """
         if len(report.arrived) != len(self.each):
             raise ProtocolError(Drop.FIELD)

@@ -92,7 +92,7 @@ def checked(scenario: Scenario, name: str) -> Scenario:
 
 
 def titles(names: Sequence[str]) -> list[str]:
-    """Short names of scenarios, with numbers if several have the same name."""
+    """Short names of scenarios, with numbers if several scenarios have the same name."""
     short = [Path(name).stem for name in names]
     return [
         name if short.count(name) == 1 else f"{name} {place}" for place, name in enumerate(short, 1)

@@ -29,8 +29,8 @@ class KeygenOptions:
     number: Annotated[int, Argument(name="id", metavar="ID")] = 1
     """Number of the first vehicle (0 to 65535); the others follow."""
     key_id: Annotated[int | None, Argument(metavar="K")] = None
-    """Number of the new keys (0 to 255); by default the highest number of the vehicle's keys plus
-    1, and for a vehicle's first key 1.
+    """Number of the new keys (0 to 255); by default 1 more than the highest number of the vehicle's
+    keys, or 1 for a vehicle's first key.
     """
     add: bool = False
     """Add keys to an existing file: keys of more vehicles, or a second key of the same vehicles."""

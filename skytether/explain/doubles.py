@@ -183,7 +183,7 @@ def _began_ns(recorded: "Recorded", client: Rows) -> int:
 
 
 def _causes(rows: Rows) -> Indices:
-    """Number of the wake or arrival that caused each row; for wakes and arrivals the row itself."""
+    """Number of the row (wake or arrival) that caused each row; a wake or arrival causes itself."""
     is_sent = rows["happened"] == SENT
     return np.maximum.accumulate(np.where(is_sent, 0, np.arange(len(rows))))
 

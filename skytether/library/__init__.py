@@ -6,6 +6,7 @@
     bad_network    emulates a bad network in front of any server
     pytest_plugin  `bad_network` as a pytest fixture, by the entry point `pytest11`
 
-`skytether.__init__` names the module of each public name and imports it when it is first used. The
-library may import any package but `gym`, inside functions; nothing imports the library.
+`skytether.__init__` has the module of each public name, and imports the module when the name is
+first used. The library may import any package but `gym`, inside functions; nothing imports the
+library.
 """

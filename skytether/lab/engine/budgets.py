@@ -232,7 +232,7 @@ class Plan:
         return {name: each.point for name, each in best if name[1] in self._budgets}
 
     def tuned(self, name: str) -> Scenario:
-        """Scenario of a contender with reports at every step, at the threshold from the search."""
+        """Scenario of a contender at the threshold from the search, with reports at every step."""
         (point,) = (
             each
             for each in self.points

@@ -185,8 +185,8 @@ TARGET = {
 inputs relative to the target's velocity (`control.input_reference`).
 """
 CIRCLE = ("paper-every-step", "paper-event", "committed-gap", "feedback-gap", "trajectory-expected")
-"""Contenders on the circle, where the reference is known in advance: a vehicle could follow the
-circle without a network.
+"""Contenders on the circle, where the reference is known in advance, so that a vehicle could follow
+the circle without a network.
 """
 
 

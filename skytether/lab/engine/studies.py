@@ -231,7 +231,7 @@ def flown(plan: Sweep, done: Results) -> CellSummaries:
 class MethodFlights:
     runs: Sequence[Summary]
     period: int | None = None
-    """Steps between packets with periodic sending; None for other methods."""
+    """Number of steps between packets with periodic sending; None for other methods."""
 
     def estimate(self, figure: str) -> Estimate:
         """Estimate of a figure; `total_packets` and `total_bytes` sum both directions."""

@@ -114,7 +114,7 @@ class FlightTask(msgspec.Struct, frozen=True):
     """Number of the task in its cell, from 0 on."""
     name: str
     scenario: Scenario
-    """Scenario to fly; the seed is replaced."""
+    """Scenario to fly; each run replaces the seed."""
     seeds: tuple[int, ...]
 
 

@@ -21,7 +21,7 @@ from skytether.shared.telemetry.record import Reason
 BLIND_NS = SECOND_NS
 """Longest time without the vehicle's state, after which the flight ends [ns]."""
 FLOWN_MAX_NS = 3600 * SECOND_NS
-"""Longest flight [ns]; it bounds the memory for measurements."""
+"""Longest flight [ns]. The limit bounds the memory for measurements."""
 
 
 class Identifying(Endpoint):

@@ -34,7 +34,8 @@ class AxisOutcome(NamedTuple):
 
     @property
     def steps(self) -> str:
-        """Sentence that says how many steps are usable."""
+        """Number of usable steps as text, followed by the number of cut steps, as in "12, 2 cut".
+        """
         return f"{len(self.responses)}{f', {self.cut} cut' if self.cut else ''}"
 
 

@@ -63,8 +63,8 @@ def reference_speeds(scenario: Scenario) -> list[float]:
 def default_speeds(scenario: Scenario) -> tuple[float, ...]:
     """Default size of the velocity steps on each axis [m/s], similar to speeds of later flights.
 
-    It is the reference's largest speed on the axis, but at least half of its largest speed on any
-    axis: on an axis without motion, feedback still causes inputs.
+    The size is the reference's largest speed on the axis, but at least half of its largest speed on
+    any axis: on an axis without motion, feedback still causes inputs.
     """
     speeds = reference_speeds(scenario)
     least = max(speeds) / 2.0 or STEP_MPS
