@@ -47,7 +47,7 @@ COMPARED = "compare"
 
 
 def names(file: str = "") -> list[str]:
-    """Names of the built-in scenarios, or of the scenarios in a file of several.
+    """Names of the built-in scenarios, or of the scenarios in a file.
 
     Args:
         file: COMPARED, or path of a file with one scenario per table; empty: built-in scenarios.
@@ -65,7 +65,8 @@ def names(file: str = "") -> list[str]:
 def load(name: str) -> Scenario:
     """Load a scenario by name, or from a file by path (any text that ends in .toml).
 
-    A scenario in a file of several is named by file and table: `compare/paper-event-gusts`.
+    If a file has several scenarios, a scenario is named by file and table:
+    `compare/paper-event-gusts`.
 
     Raises:
         ConfigError: the scenario does not exist or is invalid.

@@ -54,7 +54,7 @@ class ArduPilot(PilotedVehicle):
         return ""
 
     def mode_number(self, main: int, sub: int) -> int:  # noqa: ARG002
-        """Number of a mode as heartbeats have it: equal to the main mode in a command."""
+        """Number of a mode in a heartbeat, equal to the main mode in a command."""
         return main
 
     def takes_setpoints(self) -> bool:

@@ -210,7 +210,7 @@ def is_possible(case: FlightCase, keys: Keys) -> bool:
 
 
 def _is_there(scenario: Scenario, keys: Keys) -> bool:
-    """Whether one of the keys has another list, or a larger number, in the scenario."""
+    """Whether the scenario's value of one of the keys is another list, or a larger number."""
     for key, value in keys:
         section, _, name = key.partition(".")
         own = getattr(getattr(scenario, section), name)

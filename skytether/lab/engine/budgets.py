@@ -31,7 +31,7 @@ from skytether.shared.scenario.whole import Scenario
 BUDGETS = (1.0, 2.0, 5.0, 10.0, 20.0, 40.0)
 """Budgets: largest numbers of packets per second, both directions together, with heartbeats."""
 SOUGHT = tuple(sorted((*BUDGETS, 4.5)))
-"""Budgets for which points are chosen [packets/s]: BUDGETS, and 4.5 for `comparison.CLAIMS`:
+"""Budgets for which points are chosen [packets/s]: BUDGETS, and 4.5 for `comparison.CLAIMS`. 4.5 is
 slightly less than 12 % of the packets of the paper's scheme with the trigger `always`.
 """
 CLOSE = 1.05

@@ -194,7 +194,7 @@ class Rmse:
         return rmse * math.prod(max(1.0, each) ** 3 for each in over)
 
     def _binds(self) -> bool:
-        """Whether the event ratio is limited: if the trigger uses the state, see TRIGGER_KEYS."""
+        """Whether the event ratio is limited: only if the trigger is one of TRIGGER_KEYS."""
         named = leaves(TRIGGERS.parse(self.scenario.control.trigger))
         return any(each.name in TRIGGER_KEYS for each in named)
 

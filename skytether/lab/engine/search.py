@@ -203,7 +203,7 @@ class Search:
         return self.objective.fly(scenario, range(seed, seed + self.runs))
 
     def points(self, generations: int, fly_all: FlyAll) -> Iterator[list[SearchPoint]]:
-        """All points so far, after each generation."""
+        """Yield all points so far after each generation."""
         optimiser = Optimiser(
             self.start,
             self.free,

@@ -34,8 +34,7 @@ class AxisOutcome(NamedTuple):
 
     @property
     def steps(self) -> str:
-        """Number of usable steps as text, followed by the number of cut steps, as in "12, 2 cut".
-        """
+        """Number of usable steps as text, and of cut steps if there are any, as in "12, 2 cut"."""
         return f"{len(self.responses)}{f', {self.cut} cut' if self.cut else ''}"
 
 
