@@ -56,9 +56,7 @@ def _draw_errors(axes: "Axes", known: Explanation, moment: Moment) -> None:
 
 
 def _errors(outcome: CaseOutcome, moment: Moment) -> tuple[Array, Array]:
-    """Times [s] and errors [m] of the moment's vehicle; or, without its track, of the first
-    vehicle.
-    """
+    """Times [s] and errors [m] of the moment's vehicle; without its track, of the first vehicle."""
     tracks = [each for each in outcome.tracks if each.vehicle == moment.vehicle] or outcome.tracks
     return (tracks[0].time_s, tracks[0].error_m) if tracks else (np.zeros(0), np.zeros(0))
 

@@ -31,8 +31,7 @@ BEGINNINGS = 2
 BIN_S = 0.05
 """Time over which the residuals of steps are averaged [s]."""
 GOOD = 0.1
-"""Largest accepted difference between measured and predicted step, as a share of the step's height.
-"""
+"""Largest accepted difference between measured and predicted step, as a share of the height."""
 SURE = 4.0
 """Number of standard errors above `GOOD` at which a model is rejected."""
 
