@@ -80,8 +80,8 @@ def parse(text: str, form: str) -> Expression:
     found, between = _calls(text, form)
     if len(found) > CALLS_MAX or between.count("(") > NESTED_MAX:
         raise GrammarError(text, form)
-    # Python parses `between`, which has only operators, parentheses and a name for each call: its
-    # operators & and | have the same precedence as ours.
+    # Python parses `between`, which has only operators, parentheses and a name for each call: in
+    # Python & and | have the same precedence as here.
     rest = iter(found)
 
     def expression(node: ast.expr) -> Expression:

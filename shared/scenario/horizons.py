@@ -1,4 +1,4 @@
-"""Checks a scenario whose scheme sends horizons of inputs for contradictions."""
+"""Check for contradictions in scenarios whose scheme sends horizons of inputs."""
 
 import math
 from collections.abc import Iterator
@@ -50,7 +50,7 @@ def _too_slow(scenario: Scenario) -> Iterator[Contradiction]:
 
 
 def _too_short(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradiction of a scenario with a horizon in which the vehicle cannot brake to rest."""
+    """Contradiction of a scenario whose horizon is too short for the vehicle to brake."""
     control, vehicle, u_max = scenario.control, scenario.vehicle, max(scenario.model.u_max)
     covered_s, lossy = control.horizon * control.dt, scenario.uplink.loss > LOSSY
     least_s = u_max / vehicle.brake_mps2 * (1.0 if lossy else 0.5)

@@ -1,4 +1,4 @@
-"""Checks shapes that are given by points, by a file, or by goals for contradictions."""
+"""Check for contradictions in shapes that are given by points, by a file, or by goals."""
 
 from collections.abc import Iterator
 from itertools import pairwise

@@ -11,7 +11,7 @@ from skytether.shared.law.model import Flags, Indices
 from skytether.shared.telemetry.record import UPLINK, Record, Rows
 
 CLIENT = re.compile(r"client \d+\.(\d+)")
-"""Name of a client's host in virtual time: seed and vehicle; over UDP a host has an address."""
+"""Name of a client's host in virtual time, with seed and vehicle. Over UDP it is an address."""
 PACKETS, PLANS = 400, 50
 """Largest number of a vehicle's packets, and of its plans, that `begin_ns` compares to find tick 0.
 Both are counted from the first."""

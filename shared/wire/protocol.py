@@ -614,7 +614,7 @@ def checked(fields: tuple[Any, ...], terms: Terms) -> Message:
 
 
 def _is_of_a_room(number: int) -> bool:
-    """Load the optional message of this type number; returns False if none is installed."""
+    """Load the optional message of this type number; returns False if it is not installed."""
     if module := _ROOMS.pop(number, ""):
         with suppress(ModuleNotFoundError):
             import_module(module)

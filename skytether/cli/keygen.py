@@ -91,7 +91,7 @@ def make(
 
 
 def _number(present: keys.Keyring, vehicle: int, asked: int | None) -> int:
-    """Number of a vehicle's new key: `asked` or, by default, its highest number plus one."""
+    """Number of a vehicle's new key: `asked`, or else the vehicle's highest number plus one."""
     numbers = present.numbers(vehicle)
     what = f"{present.name}: vehicle {vehicle}"
     if len(numbers) == KEYS_MAX:

@@ -202,7 +202,7 @@ def _circle(name: str, title: str, keys: Mapping[str, Any], effort_mps: float) -
 
 
 def _network(argument: str, value: Any) -> Mapping[str, Any]:
-    """Keys that set an argument in both directions of the network; "": all impairments."""
+    """Keys that set an argument, or with "" all impairments, in both directions of the network."""
     at = f".{argument}" if argument else ""
     return {f"network.{way}{at}": value for way in ("uplink", "downlink")}
 

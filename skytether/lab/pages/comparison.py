@@ -266,7 +266,7 @@ SPENT = {
 }
 COLOURS = ("#c1272d", "0.5", "black", "#009e73")
 MARKERS = "sovD^P<*"
-"""Markers of the triggers, in order; so curves can be told apart without colour."""
+"""Markers of the triggers, in order, so that curves can be told apart without colour."""
 USER_COLOURS = ("#0072b2", "#e69f00", "#cc79a7", "#56b4e9")
 USER_MARKERS = "Xhdp>"
 
