@@ -4,7 +4,7 @@ import sys
 
 from skytether.shell.commandline.start import run
 
-if __name__ == "__main__":  # run first: the imports below are slow
+if __name__ == "__main__":  # before the slow imports below
     sys.exit(run("skytether.client.__main__:fly", "client"))
 
 import secrets
@@ -83,7 +83,7 @@ class ClientOptions(ProcessOptions):
     """Number of vehicles to fly in this process; the first has the number --id."""
     keys: Path | None = None
     """File with the vehicle's key, made by `skytether keygen`. Without this file the link is
-    plaintext; that is refused unless the server is on this machine."""
+    plaintext. A plaintext link is refused unless the server is on this machine."""
     key_id: Annotated[int | None, Argument(metavar="N")] = None
     """Number of the key to use if the file has two keys of the vehicle; by default the highest."""
     set_parameters: bool = False
@@ -144,7 +144,7 @@ def fly(argv: Sequence[str]) -> None:
         flying = [vehicles.make(scenario, number) for number in numbers]
         memory = stack.enter_context(_memory(options, flying, keyring))
         make = _saving(memory, scenario, numbers[0], running.warnings) if memory else Client
-        if kernel := sys.modules.get("skytether.shared.base.kernel"):  # a compiled simulation
+        if kernel := sys.modules.get("skytether.shared.base.kernel"):  # the simulation is compiled
             from skytether.shared.base import machine_code
 
             terminal.prepare(machine_code.missing())
@@ -264,7 +264,7 @@ def _servers(paths: Sequence[NetworkPath], standby: Sequence[NetworkPath]) -> st
 def _memory(
     options: ClientOptions, flying: Sequence[Vehicle], keyring: "Keyring | None"
 ) -> "Iterator[MemoryFile | None]":
-    """File that keeps the client's state for its next run; None if `vehicle.memory` asks for none.
+    """File that keeps the client's state for its next run; None if `vehicle.memory` keeps no state.
 
     Raises:
         CommandError: the file cannot be written, or another process uses it.
@@ -311,6 +311,6 @@ def _saving(
             warnings.append(Recalled(vehicle=number, goes_on=before.boot_id is not None))
     except ValueError as error:
         warnings.append(NotRecalled(vehicle=number, reason=str(error)))
-        # The vehicle may have been armed before: only an operator may arm it again.
+        # The lost state may be that of an armed vehicle: only an operator may arm it again.
         before = room.SavedState(frame=VehicleMemory(armed=True))
     return partial(room.SavingClient, before=before)

@@ -1,4 +1,4 @@
-"""Parts of a client whose vehicle follows a single server, and that saves no state.
+"""Parts of a client that has a single server and saves no state.
 
 Other modules replace these parts: `client.standby` with a standby server, `client.several` with
 several addresses. `client.memory` has a client whose next run continues in the middle of a flight.
@@ -32,7 +32,7 @@ class MotionInForce(NamedTuple):
 
 
 class Fresh:
-    """Replacement for `memory.SavedState` without a saved state: the flight begins anew."""
+    """Replacement for `memory.SavedState` if no state was saved: the flight begins anew."""
 
     heard_ns = 0
     began_ns: int | None = None
@@ -114,7 +114,7 @@ class OneServer:
         """Choose the server that the vehicle follows; called at each step, also on the ground."""
 
     def objection(self, scenario: Scenario) -> str:
-        """Why an operator's change of `keys` is refused at present; empty if it is accepted."""
+        """Why a change of `keys` by an operator is refused now; empty if the change is accepted."""
         return ""
 
     def obey(self, scenario: Scenario, *, now_ns: int) -> None:

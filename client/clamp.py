@@ -22,7 +22,7 @@ class Guard(Protocol):
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
     ) -> list[float]:
-        """Input that may be flown, of each axis [m/s].
+        """Input of each axis that the guard allows [m/s].
 
         Args:
             wanted: chosen input of each axis [m/s].
@@ -41,14 +41,14 @@ def clamped(
     without_feedback: Sequence[float],
     speed_max: float = math.inf,
 ) -> list[float] | None:
-    """The input that may be flown [m/s], or None if it is not finite on some axis.
+    """Bounded input of each axis [m/s]; None if a number of the chosen input is not finite.
 
     Args:
         wanted: chosen input of each axis [m/s].
         before: input flown at the previous step, of each axis, within `u_max` [m/s].
         change_max: largest change from `before` on an axis [m/s]; may be infinite.
         without_feedback: part of `wanted` that is not feedback, of each axis [m/s].
-        speed_max: bound of the magnitude of that part over all axes [m/s].
+        speed_max: largest magnitude of the vector `without_feedback` [m/s].
     """
     # Checked before min and max: with NaN, their results depend on the order of the arguments.
     if not all(map(math.isfinite, (*wanted, *without_feedback))):
@@ -60,7 +60,7 @@ def clamped(
     flown = []
     for u, part, last, most in zip(wanted, without_feedback, before, u_max, strict=True):
         near = min(max(u - excess * part, last - change_max), last + change_max)
-        # The bound u_max is applied last, so it always holds. `before` is within u_max, so the
-        # bound of the change still holds, too.
+        # The bound u_max is applied last, so it always holds. As `before` is within u_max, too,
+        # this does not increase the change from `before`.
         flown.append(min(max(near, -most), most))
     return flown

@@ -11,8 +11,8 @@ offset and drift. Any two answers bound the drift:
                                              / (t₂ - t₁)
 
 In the first seconds, when a fit would follow the noise, the drift of smallest magnitude within
-these bounds is used. The line is then shifted until it agrees with every answer: an answer bounds
-the offset at its time, and with the bounds of the drift also the present offset.
+these bounds is used. The line is then shifted until it agrees with every answer. An answer bounds
+the offset at the time of the answer and, by the bounds of the drift, the present offset.
 """
 
 from collections import deque
@@ -29,17 +29,17 @@ ASKED_MAX = 16
 ROUND_TRIP_MAX_NS = SECOND_NS
 """Longest round trip of an answer that is used, for an autopilot aboard."""
 SPREAD_NS = MILLISECOND_NS
-"""Constant part of the largest usable round trip: 1.5 times the shortest one plus SPREAD_NS."""
+"""Margin: a round trip is usable up to 1.5 times the shortest one plus SPREAD_NS [ns]."""
 DRIFT_SPAN_NS = 10 * SECOND_NS
 """Shortest time span of the answers from which the drift is fitted."""
 DRIFT_MAX = 0.02
-"""Largest usable drift of the autopilot's clock: PX4's own simulator runs 0.9 % slow."""
+"""Largest usable drift of the autopilot's clock. PX4's own simulator runs 0.9 % slow."""
 WANDER = 500e-6
-"""Largest change of the drift within the window, from a warming crystal or a busy simulator."""
+"""Largest change of the drift in the window, due to a warming crystal or a busy simulator."""
 RATED = 8
 """Number of newest answers from which the rate of an unusable clock is computed."""
 JUMP_NS = 100 * MILLISECOND_NS
-"""Deviation of an answer, beyond its round trip, that suggests a jump of the clock."""
+"""Deviation of an answer from the line that suggests a jump, beyond its round trip [ns]."""
 JUMPS = 3
 BOOT_MAX_NS = 2**62
 
@@ -89,7 +89,7 @@ class BootClock:
             return None
         (local_ns, boot_ns), (local_after_ns, boot_after_ns) = self._answers[0], self._answers[-1]
         passed_ns, boot_passed_ns = local_after_ns - local_ns, boot_after_ns - boot_ns
-        # Sum of the errors of both answers. Negative time means a reboot, not a wrong rate.
+        # Sum of the errors of both answers. A negative interval means a reboot, not a wrong rate.
         error_ns = 2 * (self.round_trip_ns or 0) + SPREAD_NS
         if (
             boot_passed_ns <= 0
@@ -194,7 +194,7 @@ class BootClock:
 def _agreeing(samples: list[Sample]) -> tuple[list[Sample], float, float]:
     """Newest answers that agree with one another, and the smallest and largest drift they allow.
 
-    Older answers date from before the drift changed, or before the clock stood still for a while.
+    Older answers disagree if the drift has changed since, or the clock stood still for a while.
     """
     least, most = -DRIFT_MAX, DRIFT_MAX
     newest = samples[-1]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from skytether.client.horizons import Horizons
 
 UNENDING = 2**30
-"""Number of steps for which a position is held: practically infinite."""
+"""Number of steps for which a position is held; so many that the hold never ends."""
 
 
 class Compensator:
@@ -44,7 +44,7 @@ class Compensator:
             horizons = load("skytether.client.horizons", f"control.scheme {terms.scheme}")
             self._horizons = horizons.Horizons(self._constants)
         self.begins = 0
-        """Step of stage 0: the step that the plan was made for, or at which it was dropped."""
+        """Step of stage 0: the plan's first step, or the step at which the plan was dropped."""
         self.follower: Follower = self._braking(np.zeros(terms.axes))
         """Follower of the plan in force; without a plan, braking or holding a position."""
         self._chosen = 0
@@ -62,7 +62,7 @@ class Compensator:
         """Number of plans that arrived after a newer plan, or for a second time."""
         self.repeated = 0
         """Number of times that the plan in force arrived again, because the server did not know
-        that it had arrived."""
+        that the plan had arrived."""
 
     def offer(self, horizon: Horizon | Trajectory, step: int, observed: int) -> bool:
         """Put a plan in force unless a newer plan has arrived; return whether it is in force now.
@@ -75,8 +75,8 @@ class Compensator:
         Raises:
             ProtocolError: the plan is too far in the future; its observation is in the future, or
                 too old for any input; the plan arrived after its last input was due, or so long
-                after its committed inputs that other inputs were flown; or the plan is a mission's
-                motion whose first knot is in the future.
+                after its committed inputs that the vehicle has flown too many other inputs; or the
+                plan is a mission's motion whose first knot is in the future.
         """
         if horizon.step > step + self._H:
             raise ProtocolError(Drop.FROM_THE_FUTURE)
@@ -94,8 +94,8 @@ class Compensator:
         if length < 1:
             raise ProtocolError(Drop.TOO_OLD)
         if self._join and horizon.step > step:
-            # The server estimated a later step than the vehicle's. Flying the motion before the
-            # step of its first knot would make the reference jump.
+            # The server estimated a later step than the vehicle's step. Flying the motion before
+            # the step of its first knot would make the reference jump.
             raise ProtocolError(Drop.TOO_EARLY)
         is_late = bool(self._join) and step - horizon.step > self._join
         if is_late or self._comes_too_late(horizon, step - horizon.step, length):
@@ -148,7 +148,7 @@ class Compensator:
         self.begins, self.follower = step, self._braking(flown_last)
 
     def _braking(self, flown: Array) -> HorizonFollower:
-        """Follower that brakes from the input `flown`: a horizon that ends after this one input."""
+        """Follower that brakes from the input `flown`: it follows a horizon with this one input."""
         return HorizonFollower(self._constants, flown[:, None], 1)
 
     def rest(self, step: int, state: Array) -> None:
@@ -181,7 +181,7 @@ class Compensator:
             stage: stage of the plan at the present step.
             length: number of its stages that may be flown.
         """
-        if self._brake and stage >= length:  # a plan that has ended would only restart the braking
+        if self._brake and stage >= length:  # a plan after its end would only restart the braking
             return True
         if self._horizons is None or isinstance(horizon, Trajectory):
             return False

@@ -7,7 +7,7 @@ from skytether.shared.endpoints.endpoint import Address
 from skytether.shared.law.heartbeat import Hearing
 
 Ends = dict[tuple[int, Address], tuple[ServerSession, int]]
-"""Session and number of the path, by socket and peer of the datagrams that arrive."""
+"""Session and path number of an arriving datagram, by its socket and its peer."""
 
 
 def connect(reach: Reach, parts: Parts) -> tuple[OneServer, Ends]:
@@ -23,8 +23,8 @@ def connect(reach: Reach, parts: Parts) -> tuple[OneServer, Ends]:
         session = ServerSession(
             parts.terms,
             vehicle=parts.vehicle,
-            # Each server gets another boot id: a packet that is delivered to the wrong server must
-            # not replace the session there.
+            # Each server gets a different boot id: otherwise a packet that is delivered to the
+            # wrong server could replace the session there.
             boot_id=parts.boot_id ^ i,
             role=servers.role(i),
             route=route,

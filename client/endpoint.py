@@ -2,8 +2,8 @@
 
 It combines `session` (the conversation with a server, made by `connections`), `pilot` (which flies
 the vehicle) and `failsafe` (which decides what the vehicle may do). `ground` and `flight_log`
-report what happens, and `orders` takes the orders of an operator. The flight runs on the client's
-own clock, so the steps go on in time without a server.
+report what happens, and `orders` takes the orders of an operator. The steps follow the client's own
+clock, so they continue on time without a server.
 """
 
 from collections import Counter
@@ -50,10 +50,10 @@ ORDERS = keys_of(InFlight.ARMED) | {*DECISIONS}
 VEHICLE_SOCKET = 1
 """Number of the socket of the vehicle's own port; socket 0 leads to the server."""
 LATEST_NS = SECOND_NS
-"""Longest time from the end of the motion to the end of a client that was asked to end [ns]."""
+"""Time after its vehicle's motion in which a client that was asked to end does so [ns]."""
 TIME_NS, TIME_ERROR_MAX_US = 2 * SECOND_NS, 2**32 - 1
-"""Interval between two TIME messages [ns], and largest error of the time of day that fits in one
-[µs]."""
+"""Interval between two TIME messages [ns], and largest error of the time of day that a TIME message
+can hold [µs]."""
 
 
 class Client(Endpoint):
@@ -186,7 +186,7 @@ class Client(Endpoint):
             horizon = session.hear(datagram.payload, path=path, now_ns=now_ns)
             if self._pilot.next_ns is None:
                 self._begin(now_ns)
-            elif self._failsafe.mode is Mode.INIT:  # the flight of an earlier run now has a session
+            elif self._failsafe.mode is Mode.INIT:  # the continued flight now has a session
                 self._failsafe.meet(Reason.OPENED, now_ns=now_ns)
             elif horizon is not None:
                 self._pilot.offer(horizon, now_ns=now_ns)

@@ -20,11 +20,11 @@ from skytether.shared.telemetry.record import Reason
 from skytether.shared.wire.protocol import Mode
 
 GOOD_NS = SECOND_NS
-"""Time for which the link has to be good before plans are accepted."""
+"""Time for which the link has to be good before plans are accepted [ns]."""
 STALL_NS = 100 * MILLISECOND_NS
-"""Lateness of a step above which the present plan counts as too old, whatever the cause."""
+"""Lateness of a step above which the plan counts as too old, whatever delayed the step [ns]."""
 LATE_NS = 500 * MILLISECOND_NS
-"""Time for which all plans have to arrive late before the vehicle brakes."""
+"""Time for which all plans have to arrive late before the vehicle brakes [ns]."""
 LATE_SHARE = 0.75
 """A plan counts as late if more than this share of its planned inputs has passed when it
 arrives."""
@@ -35,10 +35,10 @@ MALFORMED_MAX = 5
 FUTURE_MAX = 10
 """Number of plans from the future within `WINDOW_NS` after which the client opens a new session."""
 BRAKE_SPARE_NS = 500 * MILLISECOND_NS
-"""Margin added to the computed time of braking."""
+"""Margin added to the computed time of braking [ns]."""
 
 YIELDING = frozenset({Reason.TAKEN, Reason.DISARMED})
-"""Causes after which the client flies no longer: a pilot took over, or the motors are disarmed."""
+"""Causes after which the client no longer flies: a pilot took over, or the motors are disarmed."""
 GROUNDING = frozenset({Reason.BATTERY, Reason.ASTRAY, Reason.RIVAL, Reason.STRAYED})
 BROKEN = frozenset(
     {
@@ -87,8 +87,8 @@ _FAULTS = {(mode, Reason.NOT_FINITE): Mode.FAULT for mode in Mode if mode is not
 _TO_BRAKE = (
     BROKEN | GROUNDING | {Reason.ENDED, Reason.LATE, Reason.STALLED, Reason.UNARMED, Reason.LEAPT}
 )
-# Not from INIT, in which the client flies nothing yet, nor from LAND, RETURN and FAULT, which only
-# a restart ends.
+# INIT is left out, because the client flies nothing yet; so are LAND, RETURN and FAULT, which end
+# only with a restart.
 _YIELDS = {
     (mode, cause): Mode.MANUAL
     for mode in Mode
@@ -124,7 +124,7 @@ TRANSITIONS: Table = MappingProxyType(
     }
     | {(mode, cause): Mode.LAND for mode in HANGING for cause in (Reason.ALONE, Reason.WAITED)}
     | {(mode, Reason.HOMEWARD): Mode.RETURN for mode in HANGING}
-    # LOST is missing, because in SYNC the vehicle waits for a link in any case.
+    # LOST is left out, because in SYNC the vehicle waits for a link in any case.
     | {(Mode.SYNC, cause): Mode.SYNC for cause in BROKEN - {Reason.LOST}}
     | {(Mode.READY, cause): Mode.SYNC for cause in BROKEN}
     | {(Mode.TRACK, cause): Mode.BRAKE for cause in _TO_BRAKE}
@@ -157,7 +157,7 @@ itself."""
 
 
 def brake_ns(terms: Terms) -> int:
-    """Longest time of braking [ns]: from u_max on all axes at once, plus BRAKE_SPARE_NS."""
+    """Longest time of braking [ns]: from u_max on all axes to rest, plus BRAKE_SPARE_NS."""
     steps = math.ceil(math.hypot(*terms.u_max) / terms.brake) if terms.brake else 0
     return steps * terms.dt_ns + BRAKE_SPARE_NS
 
@@ -225,7 +225,7 @@ class Failsafe:
         """Start of the wait for a good link, a ready autopilot or an operator."""
         self._malformed: deque[int] = deque(maxlen=MALFORMED_MAX)
         self.has_leapt = False
-        """Whether the measured state has leapt, and the operator has not decided yet."""
+        """Whether the measured state has leapt, and no operator has decided about the leap yet."""
         self.stays = False
         """Whether an operator has chosen that the vehicle hovers on after a leap instead of
         landing."""
@@ -234,7 +234,7 @@ class Failsafe:
         self.keeps_motion = False
         """Whether a mission's motion is in force and its last knot is still ahead."""
         self.postponed: Reason | None = None
-        """First cause that takes effect only at the last knot of the motion in force, or None."""
+        """First cause postponed to the last knot of the motion in force; None if there is none."""
 
     @property
     def heard_ns(self) -> int | None:
@@ -244,8 +244,9 @@ class Failsafe:
     def takes(self) -> bool:
         """Whether a plan that arrives now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
-        # After a stall a newer motion is better than the old one. After any other cause the server
-        # that sent the newer motion is unreliable.
+        # A postponed STALLED does not refuse plans: after a stall of the vehicle's computer a newer
+        # motion is better than the one in force. Any other postponed cause makes its server
+        # unreliable.
         may = may and self.postponed in (None, Reason.STALLED)
         return may and self.armed and not self.has_leapt and self.reason not in LOCKING
 
@@ -255,16 +256,16 @@ class Failsafe:
     def _is_good(self, now_ns: int) -> bool:
         """Whether a packet of the session has arrived within two thirds of the time-out.
 
-        A heartbeat arrives at least every third of the time-out (`heartbeat.FEWEST`), so one may be
-        lost. The first one arrives up to a second (a round trip) after WELCOME.
+        A heartbeat is sent at least every third of the time-out (`heartbeat.FEWEST`), so one
+        heartbeat may be lost. The first one arrives up to a second (a round trip) after WELCOME.
         """
         return self._heard_ns is not None and now_ns - self._heard_ns <= self._timeout_ns * 2 // 3
 
     # -- messages and packets ----------------------------------------------------------------
 
     def heard(self, *, now_ns: int) -> None:
-        """Note a packet of the session; on a secured link, an authenticated one."""
-        # After a gap of more than two thirds of the time-out, the time of a good link starts again.
+        """Note a packet of the session. On a secured link the packet has been authenticated."""
+        # After a gap of more than two thirds of the time-out, the link counts as good from now on.
         if not self._is_good(now_ns):
             self._good_ns = now_ns
         self._heard_ns = now_ns
@@ -280,8 +281,8 @@ class Failsafe:
         self.meet(cause, now_ns=now_ns)
 
     def horizon_arrived(self, *, late: bool, now_ns: int) -> None:
-        """Note a plan newer than all before, accepted or not; `late`: more than LATE_SHARE of the
-        plan has passed.
+        """Note the arrival of a plan that is newer than all others before it, accepted or not;
+        `late`: more than LATE_SHARE of the plan has passed.
         """
         if not late:
             self._late_ns = None
@@ -292,7 +293,7 @@ class Failsafe:
 
     def horizon_taken(self, *, now_ns: int) -> None:
         self._horizon_ns = now_ns
-        self.postponed = None  # a postponed STALLED ends: the newer motion is in time
+        self.postponed = None  # a postponed STALLED no longer applies: the newer motion is in time
         self.meet(Reason.HORIZON, now_ns=now_ns)
 
     def malformed(self, *, now_ns: int) -> None:
@@ -345,7 +346,7 @@ class Failsafe:
         """Land if the vehicle has waited too long for a good link, a ready autopilot or an
         operator.
         """
-        # A link that is never good, or a silent autopilot, counts like a lost link.
+        # A link that is never good, or a silent autopilot, has the same effect as a lost link.
         locked = self.reason in LOCKING or self.mode is Mode.SYNC
         waits = lost or (locked and not good) or (self.has_leapt and not self.stays)
         # A link that has just returned gets one second to become good.
@@ -368,8 +369,8 @@ class Failsafe:
         self.has_leapt = self.stays = False
 
     def motion_goes_on(self, goes_on: bool, *, now_ns: int) -> None:
-        """Note whether a mission's motion is in force and its last knot still ahead (`goes_on`). At
-        the last knot the postponed cause takes effect.
+        """Note whether a mission's motion is in force and its last knot is still ahead (`goes_on`).
+        At the last knot the postponed cause takes effect.
         """
         self.keeps_motion = goes_on
         if not goes_on and self.postponed is not None:
@@ -379,9 +380,9 @@ class Failsafe:
     def meet(self, cause: Reason, *, now_ns: int) -> None:
         """Act on a cause: change mode and reason by the transition table.
 
-        The other vehicles of a mission avoid the motion in force and assume no other. So a faulty
-        or missing packet does not end the motion: such a cause takes effect at the last knot, where
-        the vehicle rests, and until then no other motion is accepted.
+        The other vehicles of a mission avoid the motion in force and expect no other motion. So a
+        faulty or missing packet does not end the motion: its cause takes effect at the last knot,
+        where the vehicle rests. Until then no other motion is accepted.
         """
         after = self._table.get((self.mode, cause))
         if after is None:
@@ -391,7 +392,7 @@ class Failsafe:
                 self.postponed = cause
             return
         if cause in LOCKING or cause is Reason.OPENED:
-            # From now on the link has to be good for GOOD_NS.
+            # The time for which the link has to be good (GOOD_NS) begins now.
             self._good_ns = now_ns
         if cause in CLOSING:
             self._heard_ns = None

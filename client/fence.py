@@ -18,9 +18,9 @@ The bounds are moved inwards by
     m = 0.06 s · u_max + 1.25 W (T + θ + 0.1 s + Δt)
 
 where W [m/s] is the wind in which the fence must hold: wind pushes the vehicle beyond the point to
-which the input leads. The factor 1.25 covers a gain of 0.8; 0.1 s covers an error in the dead time
-θ; Δt covers wind that changes before the next input. Tests check that the fence holds with time
-constants wrong by 30 %, gains by 20 % and dead times by 0.1 s.
+which the input leads. The factor 1.25 covers a true gain that is 20 % too small; 0.1 s covers an
+error in the dead time θ; Δt covers wind that changes before the next input. Tests check that the
+fence holds with time constants wrong by 30 %, gains by 20 % and dead times by 0.1 s.
 """
 
 import math
@@ -45,14 +45,15 @@ class Fence:
         self._bounds = list(zip(low, high, strict=True))
         self._home: list[float] | None = None
         self.holds = False
-        """Whether a bound on the position limited the latest input; a limit on its speed does not
-        count."""
+        """Whether a bound on the position limited the latest input. The bound on the speed,
+        `fence.speed_mps`, does not count."""
 
     def limited(
         self, wanted: Sequence[float], state: Sequence[tuple[float, float]], u_max: Sequence[float]
     ) -> list[float]:
         """See `client.clamp.Guard`."""
-        # Home is the first known position: a real vehicle need not stand at the scenario's start.
+        # Home is the first known position: a real vehicle may start elsewhere than the scenario
+        # says.
         self._home = self._home or [p for p, _ in state]
         rest = [p + tau * v for (p, v), tau in zip(state, self._tau, strict=True)]
         flown = self._inside(wanted, rest, u_max)
@@ -95,8 +96,8 @@ class Fence:
 
 
 def _slowed(back: Sequence[float], flown: Sequence[float], speed: float) -> list[float]:
-    """Input with the magnitude `speed`, between an input that leads back (`back`) and one that is
-    too fast (`flown`).
+    """Input with the magnitude `speed`, between the input `back`, which leads back inside, and the
+    input `flown`, which is too fast.
 
     The bounds allow both inputs and are convex, so they allow all inputs between these two.
     """

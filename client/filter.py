@@ -30,7 +30,7 @@ from skytether.shared.scenario import rooms
 from skytether.shared.scenario.schema import Scenario
 
 DRIFT = 0.3
-"""Strength of the random walk of w relative to q: in the time t, w moves by DRIFT q √t (RMS)."""
+"""Strength of the random walk of w relative to q: in a time t, w changes by DRIFT q √t (RMS)."""
 BEGIN_MPS = 1.0, 0.5
 """Initial standard deviations of the velocity, if it was not measured, and of w [m/s]."""
 # A variance of 0 would make the covariance singular.
@@ -203,7 +203,7 @@ class Kalman:
             self.x[:, :2] += self._late * more[:, None]
 
     def take(self, measured: Measurement, numbers: Array) -> None:
-        """Correct by a measurement of the step that the filter's state belongs to; arguments as in
+        """Correct the state by a measurement that was made at the state's step; arguments as in
         `begin`.
         """
         _, position, velocity = measured
@@ -213,7 +213,7 @@ class Kalman:
     def estimate(self) -> Array:
         """Position [m] and velocity [m/s] of each axis at the present step; shape (axes, 2)."""
         present = self.x[:, :2].copy()
-        # Predict from that step to the present, with the inputs that have acted since.
+        # Predict from the state's step to the present, with the inputs that acted since that step.
         for inputs, more in self._acted:
             present = self._model.step(present, inputs + self.x[:, 2])
             if more is not None:

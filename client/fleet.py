@@ -21,7 +21,7 @@ class ClientFleet(Endpoint):
         self.changeable = clients[0].changeable
         self._due_ns = [client.next_wake_ns() for client in clients]
         self._heap = [(due_ns, n) for n, due_ns in enumerate(self._due_ns) if due_ns is not None]
-        """Requested wakes: time [ns] and client number. Outdated entries stay until their time."""
+        """Requested wakes: time [ns] and client number. Outdated ones stay until their time."""
         heapify(self._heap)
         self._flying = set(range(len(clients)))
 

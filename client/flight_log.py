@@ -22,9 +22,9 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 HELD_AGAIN_NS = 5 * SECOND_NS
-"""Time after which the log repeats that the fence limits the vehicle."""
+"""Interval at which the log repeats that the fence limits the vehicle [ns]."""
 PLANLESS = frozenset({Reason.OPENED, Reason.GOOD, Reason.HORIZON, Reason.OLD, Reason.ENDED})
-"""Reasons of a mode that leave open why no newer plan has arrived; the log then names the cause."""
+"""Reasons of a mode that do not say why no newer plan has arrived; the log adds why."""
 
 
 class FlightLog:

@@ -19,8 +19,8 @@ from skytether.shared.wire.protocol import DISTURBANCE, GAIN_P, GAIN_V, REFERENC
 
 SENT = [GAIN_P, GAIN_V, DISTURBANCE]
 TABLED = [rule.GAIN_P, rule.GAIN_V, rule.DISTURBANCE]
-"""Columns of a horizon's feedback as sent (SENT), and the same quantities in the table of
-`shared.law.rule`."""
+"""Columns of the same feedback quantities: in a horizon as sent (SENT), and in the table of
+`shared.law.rule` (TABLED)."""
 
 
 class Follower(Protocol):
@@ -35,7 +35,7 @@ class Follower(Protocol):
         Args:
             stage: present stage.
             state: position [m] and velocity [m/s] of each axis; shape (axes, 2).
-            disturbance: ŵ estimated aboard, of each axis [m/s]; used along a spline only.
+            disturbance: estimated disturbance ŵ of each axis [m/s]; used along a spline only.
             before: input of the previous step, of each axis [m/s]; used along a spline only.
 
         Source: eq. (11).

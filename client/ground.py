@@ -15,7 +15,7 @@ from skytether.shared.events.ground import (
 )
 
 WAITED_NS = 2 * SECOND_NS
-"""Delay before the log gives the reason why the vehicle cannot fly."""
+"""Time for which the vehicle waits before the log gives the reason [ns]."""
 SILENT_NS = 3 * SECOND_NS
 """Time beyond the time-out after which the server of a vehicle on the ground counts as silent.
 
@@ -24,14 +24,14 @@ one of eight HELLOs is nearly always answered."""
 
 
 def unanswered(session: ServerSession, left_ns: int) -> Unanswered:
-    """Event for a session that its server has not opened, `left_ns` before the client gives up."""
+    """Event: the session is not open yet; the client gives up after another `left_ns` [ns]."""
     (host, port), others = session.address, session.route.others
     left_s = left_ns / SECOND_NS
     return Unanswered(vehicle=session.vehicle, host=host, port=port, others=others, left_s=left_s)
 
 
 def no_answer(session: ServerSession, waited_ns: int) -> NoAnswer:
-    """Event for a session that the client gives up, because no server answers."""
+    """Event: the client gives up the session, because no server answers."""
     host, port = session.address
     return NoAnswer(
         vehicle=session.vehicle,

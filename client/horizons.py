@@ -12,15 +12,16 @@ def late_max(horizon: int) -> int:
     """Number of steps after the committed ones within which a horizon may still come into force.
 
     In these steps the vehicle flies other inputs than the horizon has for them. The next plan
-    corrects a few such steps; many would make the server's estimate and its plans oscillate.
+    corrects a few such steps; many such steps would make the server's estimate and its plans
+    oscillate.
     """
-    # A longer allowance let the estimate oscillate until the vehicle flew away
+    # With more steps the estimate oscillated until the vehicle flew away
     # (tests/server/test_slow.py).
     return max(2, horizon // 4)
 
 
 class Horizons:
-    """Handling of arriving horizons of inputs, where it differs from that of trajectories."""
+    """Rules for arriving horizons of inputs, where they differ from the rules for trajectories."""
 
     def __init__(self, constants: Constants) -> None:
         terms, self._constants = constants.terms, constants
@@ -35,12 +36,12 @@ class Horizons:
         return horizon.inputs[:, :1].repeat(self._lasts, axis=1)
 
     def is_late(self, horizon: Horizon, stage: int) -> bool:
-        """Whether a horizon arrives, at this stage, so long after its committed inputs that too
-        many other inputs were flown.
+        """Whether a horizon that arrives at this stage is too late: too many steps after its
+        committed inputs were flown with other inputs.
         """
         return self._commits and stage > horizon.inputs.shape[1] - self._H + late_max(self._H)
 
     def follower(self, horizon: Horizon, length: int) -> HorizonFollower:
-        """Follower of a horizon of which `length` inputs may be flown."""
+        """Follower of a horizon; `length`: number of its inputs that may be flown."""
         feedback = horizon.feedback if horizon.feedback.size else None
         return HorizonFollower(self._constants, self.inputs(horizon), length, feedback)

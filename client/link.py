@@ -25,7 +25,7 @@ class ClientLink(Protocol):
         pass
 
     def seal(self, payload: bytes) -> bytes:
-        """Datagram that carries any message except a HELLO."""
+        """Datagram with a message of any type except HELLO."""
 
     def open(self, datagram: bytes, *, now_ns: int) -> bytes | None:
         """Message in a datagram; None for a datagram of the handshake, whose answer is in `outbox`.

@@ -37,7 +37,7 @@ from skytether.shared.wire.protocol import KNOTS_MAX
 TIME_MAX_NS = 2**62
 STEP_MAX = 2**40
 REFRESHES = 3
-"""Number of times that an unchanged state is written before the first copy would be too old."""
+"""Number of times that an unchanged state is written within the largest age of a saved state."""
 WAIT_NS = 500 * MILLISECOND_NS
 """Longest time for which a client waits for its state to be saved [ns]: less than the leader's
 silence after which the client asks a standby server."""
@@ -194,8 +194,8 @@ class ClientMemory:
         self._saved = self._handed[0] if self._handed and not nothing else None
 
     def may_tell(self, state: SavedState, *, now_ns: int) -> bool:
-        """Whether messages may be sent: this state is on the disk, no older state is on the disk,
-        or saving has failed, which the messages then report (`unsaved`).
+        """Whether messages may be sent. They may if this state is on the disk, if no older state is
+        there, or if saving has failed; the messages then report this failure (`unsaved`).
         """
         if self._saved is not None and _is_same(state, self._saved):
             self._differs_ns, self.unsaved = None, False
@@ -267,7 +267,7 @@ class SavingClient(Client):
 
 
 def _is_same(one: SavedState, other: SavedState) -> bool:
-    """Whether two states mean the same to the next run: times that only advance are ignored."""
+    """Whether two states are equal for the next run; times that only advance are ignored."""
     return _compared_part(one) == _compared_part(other)
 
 

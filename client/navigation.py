@@ -2,8 +2,8 @@
 
 With a dead time, feedback and observations use not the present state but the predicted state in
 which the next input will take effect (`shared.law.dead_time`). A sensor that measures the exact
-state at every step needs no filter, unless the estimate of the disturbance is needed: to predict
-over a dead time, or to follow a spline.
+state at every step needs no filter. A filter is used all the same if the disturbance has to be
+estimated, to predict over a dead time or to follow a spline.
 """
 
 import math
@@ -31,7 +31,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.wire.protocol import FLOAT_MAX
 
 CARRIED_NS = SECOND_NS // 2
-"""Longest time over which a measurement is extrapolated, even if the measurement is older."""
+"""Longest time over which a measurement is extrapolated [ns], even if the measurement is older."""
 SIGMAS = 10.0
 """Number of standard deviations of sensor noise by which two measurements may differ without a
 leap."""
@@ -142,7 +142,7 @@ class Navigation:
             self.is_known = all_within(self.predicted, FLOAT_MAX)
 
     def begin_anew(self) -> None:
-        """Start again from the next measurement: the frame, and so the position, has changed."""
+        """Start again from the next measurement, because frame and position have changed."""
         self._begun, self.leaps = False, Leaps(self._scenario)
 
     @property
@@ -178,7 +178,7 @@ class Navigation:
 
 
 def _newest(measurements: Sequence[Measurement]) -> Sequence[Measurement]:
-    """Newest measurement with a position, and all later ones: the filter starts from these.
+    """Newest measurement with a position, and all later measurements; the filter starts from them.
 
     Before the first step somebody else flew the vehicle, such as the autopilot during its climb.
     The filter, which knows only the client's inputs, would see that motion as a disturbance.

@@ -48,7 +48,7 @@ class SeveralPaths(Route):
         self._paths: Paths | None = None
         """State of the paths in the present session; None before the first session."""
         self._proofs: dict[int, int] = {}
-        """Number to return as the proof of each path, from the server's newest request, by path."""
+        """Proof of each path to be returned: the number in the server's newest request, by path."""
         self._greeted = 0
         """Path of the next HELLO."""
 
@@ -80,7 +80,7 @@ class SeveralPaths(Route):
         return True
 
     def watch(self, session: Conversation, now_ns: int) -> None:
-        """Repeat the newest packet if it was lost; probe paths; log paths that died or healed."""
+        """Repeat the newest packet if it was lost; probe paths; log paths that fail or recover."""
         if self._paths is None:
             return
         if resent := self._paths.again(session.hearing.silence_ns, now_ns, self._all):

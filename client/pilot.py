@@ -47,7 +47,7 @@ HOVERING = frozenset({Mode.INIT, Mode.SYNC, Mode.READY, Mode.HOVER, Mode.LAND})
 UNPLACED = frozenset({Reason.MUTE, Reason.UNUSABLE, Reason.ASTRAY})
 """Reasons for hovering that mean that the vehicle's position is unknown."""
 IMPOSSIBLE = frozenset({Drop.FROM_THE_FUTURE, Drop.OBSERVATION})
-"""Reasons for dropping a plan that was made for, or from, a step in the future."""
+"""Reasons for dropping a plan that was made for a step, or from an observation, in the future."""
 
 
 class Pilot:
@@ -72,8 +72,8 @@ class Pilot:
         self._failsafe = failsafe
         self._recorder = recorder
         self._holds = scenario.keeps_apart or (vehicle.drifts and failsafe.brakes)
-        """Whether a hovering vehicle holds its position by feedback. A commanded velocity of zero
-        would let it drift, but other vehicles of a mission avoid only that position."""
+        """Whether a hovering vehicle holds its position by feedback. With a velocity command of
+        zero it would drift, but other vehicles of a mission avoid only its position."""
         along = regulator(scenario) if self._splines or self._holds else None
         self.compensator = Compensator(self._terms, along)
         self._reporter = Reporter(self._terms, scenario.vehicle.report, self.compensator)
@@ -91,7 +91,7 @@ class Pilot:
         """Largest change of the input from step to step [m/s]."""
         self._epoch_ns: int | None = None
         self.next_ns: int | None = None
-        """Time at which the next step begins; None before the flight."""
+        """Time at which the next step begins [ns]; None before the flight."""
         self.step = 0
         self.flown = 0
         """Present step; measurements up to its start are included."""
@@ -102,7 +102,7 @@ class Pilot:
         self._input = np.zeros(self._terms.axes)
         """Desired velocity flown now [m/s]; shape (axes,)."""
         self._speed = 0.0
-        """Magnitude of the input without feedback [m/s]."""
+        """Magnitude of the part of the input that is not feedback [m/s]."""
         self.covered = 0
         self._covered_last = 0
         """Step after the last step with a planned input."""
@@ -157,11 +157,11 @@ class Pilot:
         if self._failsafe.transitions:
             self.obey()
         terms = self._terms
-        # An overtaken plan is always late, and shows nothing about the delay of the newest plan.
+        # An overtaken plan is always late, so it says nothing about the newest plan's delay.
         if horizon.step > self.compensator.newest:
             passed = self.step - horizon.step
             if isinstance(horizon, Horizon):
-                # The first inputs are committed: usually their steps are over on arrival.
+                # The committed inputs come first, and usually their steps are over on arrival.
                 passed -= horizon.inputs.shape[1] - terms.planned
             self._failsafe.horizon_arrived(late=passed > self._late, now_ns=now_ns)
         observed = horizon.step - horizon.age
@@ -184,7 +184,7 @@ class Pilot:
         return self._keeps_apart and step < self.compensator.last_step
 
     def motion_in_force(self) -> MotionInForce | None:
-        """Motion of a mission in force; None without one."""
+        """The mission's motion that is in force; None without one."""
         compensator = self.compensator
         flown = compensator.follower
         if not self._keeps_apart or compensator.in_force == NO_HORIZON:
@@ -238,7 +238,7 @@ class Pilot:
         # A client that wakes after the end of its flight still flies the last step.
         present = min((now_ns - self._epoch_ns) // self._dt_ns, self.steps - 1)
         self.missed += present - self.step
-        # Missed steps are navigated one by one: the filter predicts one step at a time.
+        # The filter predicts one step at a time, so it passes through missed steps one by one.
         for step in range(self.flown, present):
             self._navigate(step + 1)
         self.late_ns = now_ns - self.next_ns
@@ -276,7 +276,9 @@ class Pilot:
         self._navigation.advance(measurements, self._input, now_ns=now_ns)
 
     def _meet_causes(self, now_ns: int) -> None:
-        """Let the failsafe act on the causes that hold at the start of the present step."""
+        """Report to the failsafe what may change the mode at this step (lateness, a hindrance, an
+        unknown state, a leap), and obey its transitions.
+        """
         failsafe, navigation = self._failsafe, self._navigation
         hindrance = self._vehicle.hindrance(now_ns=now_ns)
         if self._keeps_apart:
@@ -305,7 +307,8 @@ class Pilot:
         """Input of the present step: the compensator's input, bounded by mode, clamp and fence.
 
         Returns:
-            input of each axis [m/s]; speed from which the braking curve goes on [m/s]; and whether
+            input of each axis [m/s]; speed at which the braking curve continues at the next step
+                [m/s]; and whether
             the compensator's input is finite: if not, the returned input is zero.
         """
         mode, terms, compensator = self._failsafe.mode, self._terms, self.compensator
@@ -335,7 +338,8 @@ class Pilot:
         if flown is None or mode in STOPPED:
             return [0.0] * terms.axes, 0.0, flown is not None
         # The braking curve bounds the input without feedback; only u_max bounds the feedback
-        # (docs/failsafe.md). The fence's correction does not count, either: it may never end.
+        # (docs/failsafe.md). The fence's correction is not part of the speed either, as it may
+        # never end.
         speed = min(math.hypot(*without_feedback), speed_max) if feeds_back else math.hypot(*flown)
         if self._fence is not None:
             within = self._fence.limited(flown, navigation.predicted.tolist(), terms.u_max)

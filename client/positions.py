@@ -128,7 +128,7 @@ class Positions:
         if self._recalled is not None:
             self._recall(self._recalled, now_ns)
         stamp_ns = min(self._clock.local_ns(boot_ns), now_ns)
-        if self._newest_ns is not None:  # a corrected clock must not reverse the order
+        if self._newest_ns is not None:  # keeps the order if the clock was corrected
             stamp_ns = max(stamp_ns, self._newest_ns + 1)
         self._newest_boot_ns, self._newest_ns = boot_ns, stamp_ns
         self.position, self.velocity = position, velocity
@@ -142,8 +142,8 @@ class Positions:
         )
 
     def _watch(self, leaps: Leaps, measured: Measurement) -> None:
-        """Detect a leap of the position, and then displace the origin by the same vector: no
-        vehicle can have moved that far.
+        """Displace the origin by each leap of the position, because no vehicle can have moved that
+        far.
         """
         if leaps.leaps(measured, measured.numbers()) and leaps.off_m and self.is_flown:
             dx, dy, dz = leaps.off_m
@@ -158,7 +158,7 @@ class Positions:
             self.leap_m = before[0] + dx, before[1] + dy, before[2] + dz
 
     def decide(self, *, keeps_frame: bool) -> None:
-        """Keep the old frame for good, or use the new frame: undo the displacement."""
+        """Keep the old frame for good, or return to the new frame by undoing the displacement."""
         if self.leap_m is not None and not keeps_frame:
             pairs = zip(self.origin, self.leap_m, strict=True)
             x, y, z = (zero - leapt for zero, leapt in pairs)

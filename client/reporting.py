@@ -42,7 +42,7 @@ class Reporter:
 
     Args:
         report: `vehicle.report`.
-        compensator: has the plan in force, which gave the input of the step.
+        compensator: holds the plan in force, from which the input of the step was computed.
     """
 
     def __init__(self, terms: Terms, report: str, compensator: Compensator) -> None:

@@ -15,7 +15,7 @@ from skytether.shared.scenario.registry import REPORTS
 
 
 class Unreported(Struct, frozen=True):
-    """Input of a policy at one step: changes since the last observation, unknown to the server."""
+    """Input of a policy at one step: what has changed since the last observation."""
 
     off_m: float
     """Distance of the vehicle from the state that the server predicts [m], see

@@ -48,7 +48,7 @@ class SecureLink:
     """Link that only the holder of the vehicle's key can read or write.
 
     Args:
-        entropy: returns this many unpredictable bytes.
+        entropy: function that returns the given number of unpredictable bytes.
     """
 
     secure = True
@@ -60,7 +60,7 @@ class SecureLink:
         self._cookie = NO_COOKIE
         """Newest cookie, also from earlier attempts."""
         self._answers: list[bytes] = []
-        """INITIATIONs to be sent, which answer CHALLENGEs."""
+        """INITIATIONs to be sent, each as the answer to a CHALLENGE."""
         self._attempt: _Attempt | None = None
         self._candidate: Channel | None = None
         self._current: Channel | None = None

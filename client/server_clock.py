@@ -13,7 +13,7 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import stamped_ns
 
 SLEPT_NS = JUMP_NS // 2
-"""Advance of the server's clock over the client's that shows that this machine was suspended;
+"""If the server's clock gains more than this on the client's [ns], this machine was suspended;
 changes of the delay cause far less."""
 
 
@@ -63,15 +63,15 @@ class ServerClock:
     def hear(self, server_ns: int, now_ns: int) -> bool:
         """Note a packet sent at a time of the server; returns whether this machine was suspended.
 
-        In a suspension the client's clock may stand still; if it jumps afterwards, the jump is
-        mistaken for a clock that was set (`shared.endpoints.steady`). In both cases the server's
-        clock is ahead. After a suspension too long for time stamps, the server has forgotten the
-        session, and its WELCOME contains the full time.
+        In a suspension the client's clock may stand still. If it jumps forward instead, the client
+        takes the jump for a clock that was set (`shared.endpoints.steady`). In both cases the
+        server's clock is ahead. After a suspension too long for time stamps, the server has
+        forgotten the session, and its WELCOME contains the full time.
         """
         slept = self.echo != NEVER and server_ns - self._expected_ns(now_ns) > SLEPT_NS
         self.echo = Echo(server_ns, now_ns, (self.echo.heard + 1) % NUMBERS)
         return slept
 
     def _expected_ns(self, now_ns: int) -> int:
-        """Server's time [ns] if the delay has not changed since the newest packet."""
+        """Present time of the server [ns], if the delay has not changed since the newest packet."""
         return self.echo.server_ns + now_ns - self.echo.received_ns

@@ -47,7 +47,7 @@ REFUSED = {
 }
 """Reason for dropping a WELCOME that refuses the vehicle, by the refusal."""
 DEAF = frozenset({Idle.OBSERVATION, Idle.DELAY})
-"""Reasons why a server cannot plan although another server may be able to."""
+"""Reasons why one server cannot plan for the vehicle, although another server may be able to."""
 DEGRADED = "the server misses its deadlines"
 """Reason for the lack of newer plans if the server reports that it is degraded."""
 
@@ -98,10 +98,11 @@ class ServerSession:
         self.sent = 0
         """Number of packets sent in the session, modulo NUMBERS."""
         self.heard_ns: int | None = None
-        """Time of the newest packet of the session; None before the first packet and after the end.
-        """
+        """Time of the newest packet of the session [ns]; None before the first one and after the
+        end."""
         self.useful_ns: int | None = None
-        """Time of the newest packet, without heartbeats that report that the server cannot plan."""
+        """Time of the newest packet [ns], except heartbeats that report that the server cannot
+        plan."""
         self.sent_step = -1
         """Step of the newest observation; -1 before the first of the session."""
         self._events = events
@@ -155,7 +156,7 @@ class ServerSession:
             for answer in self.link.outbox():
                 self.route.put(answer, path)
             # The answer to a CHALLENGE contains the HELLO, so the next HELLO is delayed. If no
-            # WELCOME is awaited, an attacker has replayed an old HELLO.
+            # WELCOME is awaited, the CHALLENGE answers an old HELLO that an attacker has replayed.
             if self._awaits_welcome:
                 self.hello_ns = now_ns + AGAIN_NS
             return None
@@ -202,7 +203,7 @@ class ServerSession:
         try:
             return self.role.decode(payload, self._terms)
         except ProtocolError:
-            # Not in plaintext: there anybody could make the vehicle brake with five packets.
+            # Plaintext does not count: anybody could make the vehicle brake with five packets.
             if self.link.secure:
                 self.role.malformed(now_ns=now_ns)
             raise
@@ -211,12 +212,12 @@ class ServerSession:
         if (welcome.vehicle, welcome.boot_id) != (self.vehicle, self._boot_id):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         if not self._awaits_welcome:
-            # No session is requested now: the WELCOME is a late copy, or answers a late copy of a
-            # HELLO.
+            # No session is requested now, so the WELCOME is a late copy, or answers a late copy of
+            # a HELLO.
             raise ProtocolError(Drop.UNASKED)
         if welcome.terms != self._terms:
-            # Other terms end the client only before its first session. In flight the vehicle keeps
-            # its plan, and the failsafe decides.
+            # Different terms end the client only before its first session. In flight the vehicle
+            # keeps its plan, and the failsafe decides.
             if self.number is None and self.failure is None:
                 differing = differences(self._terms, welcome.terms)
                 self._fail(SessionRefused(vehicle=self.vehicle, differences=differing))

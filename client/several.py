@@ -87,7 +87,7 @@ class Several(Reach):
             parts.out,
             events=parts.events,
             names=names,
-            # Equal prices if the scenario has another number of paths.
+            # All prices are equal if the scenario has prices for another number of paths.
             prices=prices if len(prices) == len(paths) else (1.0,) * len(paths),
             spread=link.spread,
             timeout_ns=seconds_to_ns(link.timeout_s),

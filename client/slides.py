@@ -56,7 +56,7 @@ class Slides:
         self._velocity: Plane = (0.0, 0.0)
         self._stamp_ns = -FIX_GAP_NS
         self._until_ns: int | None = None
-        """Time until which the present slide is measured; None without a slide."""
+        """Time until which the present slide is measured [ns]; None without a slide."""
         self._next_ns = 0
 
     def begin(self) -> None:
@@ -68,7 +68,7 @@ class Slides:
         """Slide to be subtracted from the position from now on; None if none was detected.
 
         Args:
-            place: position in the plane, from which earlier slides are subtracted [m].
+            place: position in the plane, minus all earlier slides [m].
             velocity: velocity of a fix of the receiver [m/s].
             stamp_ns: time of the fix [ns].
         """

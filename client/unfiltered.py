@@ -22,7 +22,7 @@ class Newest:
         pass
 
     def disturbance(self) -> Array:
-        """Disturbance of each axis: unknown, so 0 [m/s]."""
+        """Disturbance of each axis [m/s]: 0, because it is not estimated."""
         return self._zero
 
     def take(self, measured: Measurement, numbers: Array) -> None:

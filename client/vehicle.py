@@ -97,9 +97,9 @@ class Vehicle(ABC):
         """
 
     def set_parameters(self) -> bool:
-        """Allow the client to change unsafe parameters of the hardware; False if there are none.
+        """Allow the client to change unsafe parameters of the hardware; False if it has none.
 
-        If it is called, it is called before any other method.
+        The client calls this before any other method, or never.
         """
         return False
 
@@ -123,8 +123,8 @@ class Vehicle(ABC):
 
     @property
     def took_off(self) -> bool:
-        """Whether the vehicle has taken off during this run of the client; then an earlier run's
-        motion is not continued.
+        """Whether the vehicle has taken off during this run of the client. If so, the motion of an
+        earlier run is not continued.
         """
         return False
 
@@ -158,8 +158,8 @@ class Vehicle(ABC):
         return VehicleMemory()
 
     def recall(self, frame: VehicleMemory) -> None:  # noqa: B027 - optional
-        """Restore the state that an earlier run of the client saved. If it is called, it is called
-        before any other method.
+        """Restore the state that an earlier run of the client saved. The client calls this before
+        any other method, or never.
         """
 
     def arm(self) -> None:  # noqa: B027 - optional

@@ -48,6 +48,6 @@ def connection(flies: Vehicle, scenario: Scenario) -> "Line | Node | None":
 def apart_ns(vehicles: int, dt_ns: int) -> int:
     """Time from one vehicle's start to the next's [ns]: one step, less in a large fleet.
 
-    Vehicles that start together would send all their packets together, and the packets would queue.
+    If all vehicles started at once, their packets would be sent at the same times and would queue.
     """
     return min(dt_ns, START_NS // vehicles)

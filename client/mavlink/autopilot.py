@@ -41,7 +41,7 @@ WARNING = int(dialect.MAV_SEVERITY_WARNING)
 
 
 class Parts(NamedTuple):
-    """Parts created once the kind of autopilot is known."""
+    """Parts that depend on the kind of autopilot, and are created once that kind is known."""
 
     setup: Setup
     launch: Launch
@@ -108,7 +108,8 @@ class Autopilot:
         return now_ns - since_ns > QUIET_NS
 
     def take_off(self, *, may_arm: bool, now_ns: int) -> bool:
-        # An earlier run that has flown the vehicle since this boot has checked its parameters.
+        # `is_recalled`: an earlier run flew the vehicle since this boot, so it checked the
+        # parameters.
         may_fly = self.is_ready or self.positions.is_recalled
         if self.parts is None or not may_fly or self.failure:
             return False

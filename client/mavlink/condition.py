@@ -8,11 +8,13 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 ASTRAY_NS = 500 * MILLISECOND_NS
-"""Time after which a bad estimate counts: its flags flicker when satellites change."""
+"""Time for which the estimate must be bad before the failsafe is told [ns], because its flags
+flicker when satellites change."""
 LOW_NS = 2 * SECOND_NS
-"""Time after which a low battery counts: its voltage sags under thrust."""
+"""Time for which the battery must be low before the failsafe is told [ns], because its voltage sags
+briefly under thrust."""
 FRESH_NS = 2500 * MILLISECOND_NS
-"""Age up to which a heartbeat counts as current: one heartbeat may be lost."""
+"""Age up to which a heartbeat counts as current [ns]; so long that one heartbeat may be lost."""
 NUMBERS = 256
 """Range of the sequence numbers of frames, which wrap around."""
 OVERTAKEN_NS = SECOND_NS
@@ -69,8 +71,8 @@ class Condition:
     def hear(self, message: Message, *, now_ns: int) -> None:
         """Process a message of the autopilot, unless a newer one arrived before it.
 
-        These messages have no time stamps. Without this check an overtaken heartbeat would undo the
-        mode that a pilot has just chosen.
+        These messages have no time stamps. So the sequence number is checked: otherwise a heartbeat
+        that was overtaken would hide the mode that a pilot has just chosen.
         """
         if self.heard_ns is not None and now_ns - self.heard_ns > UNHEARD_NS:
             self.receiver.unheard(now_ns=now_ns)
@@ -158,7 +160,7 @@ class Condition:
 
 
 def _since(before_ns: int | None, now_so: bool, now_ns: int) -> int | None:
-    """Start time of a condition that holds now; None if it does not hold."""
+    """Time since which a condition has held; None if it does not hold now (`now_so`)."""
     if not now_so:
         return None
     return now_ns if before_ns is None else before_ns

@@ -1,4 +1,4 @@
-"""Connection to the autopilot: its address and numbers, and the sender of each message.
+"""Connection to the autopilot: its address, its numbers, and the sorting of messages by sender.
 
 The client flies the first autopilot that sends a heartbeat. If that autopilot falls silent and its
 heartbeats then come from another address, it has restarted: on a UDP line, the client uses the new
@@ -47,8 +47,8 @@ class Connection:
         """Address and numbers of a sender that may be the autopilot, before its first heartbeat."""
         self.codec = Codec(keys.system, keys.component, stream=line.kind in ("tcp", "serial"))
         self.counts: Counter[str] = Counter()
-        """Number of messages `heard`, from other senders (`foreign`) and `for_others`, and of
-        datagrams from `elsewhere`."""
+        """Number of messages from the autopilot (`heard`), from other senders (`foreign`) and to
+        other receivers (`for_others`), and of datagrams from other addresses (`elsewhere`)."""
         self._elsewhere: list[Address] = []
         """Other addresses from which datagrams arrived while the autopilot was silent."""
 
@@ -69,7 +69,7 @@ class Connection:
         return arrivals
 
     def _sorted(self, messages: Sequence[Message], peer: Address) -> Arrivals:
-        """Messages by sender. The first heartbeat of an autopilot selects this autopilot."""
+        """Messages by sender; the first heartbeat of an autopilot makes it the client's own."""
         heard, others, met = [], [], None
         for message in messages:
             sender = _sender(message)
@@ -128,7 +128,7 @@ class Connection:
         self._elsewhere.clear()
 
     def _report_elsewhere(self, peer: Address, messages: Sequence[Message]) -> None:
-        """Report once per address that its datagrams are not from the autopilot."""
+        """Report once for each address that its datagrams are not from the autopilot."""
         if peer in self._elsewhere or len(self._elsewhere) == ADDRESSES_REPORTED:
             return
         self._elsewhere.append(peer)

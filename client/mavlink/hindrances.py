@@ -88,7 +88,7 @@ class Hindrances:
         return self._silence(now_ns)
 
     def _rival(self, now_ns: int) -> Reason | None:
-        """Reason for a second commander, by the kind of detection; None if none was detected."""
+        """Reason for a second commander, by how it was detected; None if none was detected."""
         event: VehicleEvent
         if self.rivals.are_there(now_ns=now_ns):
             system, component, content = self.rivals.newest

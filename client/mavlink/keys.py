@@ -9,7 +9,7 @@ from skytether.shared.scenario.owners import Key, OfVehicle, Owner
 from skytether.shared.scenario.schema import Contradiction, Position, Scenario, Section
 
 ORIGIN = "origin"
-"""Group of keys: origin of the scenario's frame, for a vehicle in the air without an origin."""
+"""Group of `mavlink.origin`, which may be set in flight only while the origin is unknown."""
 
 
 class MavlinkConfig(Section, frozen=True):

@@ -2,10 +2,11 @@
 
     GROUND → CLIMBING (the steps of its flavour, one after another) → FLYING → LANDING → down
 
-A step is done when the autopilot's state shows it; until then its command is repeated. A vehicle is
-armed only on the ground and only if `armed` is set in the scenario. A mode chosen by somebody else
-is not changed: once the vehicle is armed, the client replaces only a mode that it has set, or to
-which its take-off command led. A pilot returns control with the mode that follows set-points.
+A step is done when the autopilot's state shows the result; until then the step's command is
+repeated. A vehicle is armed only on the ground and only if `armed` is set in the scenario. A mode
+chosen by somebody else is not changed: once the vehicle is armed, the client replaces only a mode
+that it has set, or to which its take-off command led. A pilot returns control to the client by
+choosing the mode that follows set-points.
 
 A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
 an operator allows arming: a process restarted after a landing must not make the vehicle take off. A
@@ -37,9 +38,9 @@ FRESH_NS = 500 * MILLISECOND_NS
 LAND_MAX_NS = 120 * SECOND_NS
 RETURN_MAX_NS = 600 * SECOND_NS
 REFUSED_NS = 4 * SECOND_NS
-"""Time after which a vehicle that ignores the command to return is commanded to land."""
+"""Time for which a vehicle may ignore the command to return before it is commanded to land [ns]."""
 QUIET_NS = 3 * SECOND_NS
-"""Silence of the autopilot after which it is given as the reason for an unfinished step."""
+"""Silence of the autopilot after which the log gives it as the reason for an unfinished step."""
 SILENT_MAX_NS = 10 * SECOND_NS
 """Silence of the autopilot after which the client stops waiting for the end of a landing."""
 THERE_M = 0.3
@@ -106,7 +107,7 @@ class Launch:
         self._step = 0
         self._since_ns: int | None = None
         self._asked_ns: int | None = None
-        """Time at which the command of the current step was last sent."""
+        """Time at which the command of the present step was last sent [ns]."""
         self._accepted = False
         self._own_mode: int | None = None
         """Number of the mode, other than the guided one, that the client has set; None in flight,
@@ -159,7 +160,7 @@ class Launch:
         return came_ns is not None and now_ns - came_ns <= FRESH_NS
 
     def _begin(self, may_arm: bool, now_ns: int) -> None:
-        """Begin the climb when possible; fly a vehicle that is already in the air."""
+        """Begin the climb when possible; take over a vehicle that is already in the air."""
         condition, flavour = self._condition, self._flavour
         mode, guided = flavour.mode_name(condition.mode), flavour.mode_name(flavour.guided)
         if self._silence(now_ns):
@@ -200,7 +201,7 @@ class Launch:
             self._events.append(OriginAwaited(vehicle=self._vehicle, place=place))
         elif now_ns - self._hovers_ns > self._patience_ns:
             waited = f"not flown in {self._patience_ns / SECOND_NS:g} s"
-            self._enter(Phase.FLYING, now_ns)  # `_fail` lands only a vehicle in flight
+            self._enter(Phase.FLYING, now_ns)  # `_fail` lands a vehicle only in this phase
             self._fail(waited, "its origin is unknown, see mavlink.origin", now_ns)
 
     def _ask_to_arm(self) -> None:
@@ -264,7 +265,7 @@ class Launch:
                 return at_altitude and abs(self._positions.velocity[2]) < STILL_MPS
 
     def _wait(self, doing: str, why: str, now_ns: int) -> None:
-        """Wait for the autopilot; give up after too long."""
+        """Wait until the autopilot has done a step; give up after too long."""
         if self._since_ns is None:
             self._since_ns = now_ns
         if self.phase is Phase.GROUND:
@@ -289,8 +290,8 @@ class Launch:
 
     @property
     def streams_zeros(self) -> bool:
-        """Whether zero set-points have to be sent: the next mode needs a stream of them, or the
-        vehicle hovers.
+        """Whether a stream of zero set-points has to be sent, because the next mode needs the
+        stream or because the vehicle hovers.
         """
         if self.phase is Phase.GROUND and self._hovers_ns is not None:
             return self._condition.mode == self._flavour.guided
@@ -319,7 +320,7 @@ class Launch:
         return [self._mode_command(self._flavour.land)]
 
     def _is_ours(self, now_ns: int) -> bool:
-        """Whether the vehicle is armed and in a mode of the client, by a current heartbeat."""
+        """Whether a current heartbeat shows the vehicle armed and in a mode of the client."""
         condition = self._condition
         return self._has_own_mode(now_ns) and condition.armed and condition.is_fresh(now_ns=now_ns)
 
@@ -332,7 +333,7 @@ class Launch:
         if self._holds_first(mode):
             self._own_mode = mode
         elif self._own_mode == flavour.hold and self._lift_asked and not is_high:
-            # Until the next heartbeat the known mode is the one before the command.
+            # Until the next heartbeat arrives, the known mode is the mode before the command.
             if mode == flavour.lift or self._is_late_to_lift(now_ns):
                 self._own_mode = flavour.lift
         elif self._own_mode == flavour.lift and is_high and mode == flavour.hold:
@@ -350,7 +351,7 @@ class Launch:
         return is_asked and self._flavour.steps[self._step] is LaunchStep.HOLD
 
     def _is_late_to_lift(self, now_ns: int) -> bool:
-        """Whether the mode of an accepted take-off command is overdue."""
+        """Whether the mode to which an accepted take-off command leads has not appeared in time."""
         climbs = self.phase is Phase.CLIMBING and self._accepted
         if not climbs or self._flavour.steps[self._step] is not LaunchStep.CLIMB:
             return False
@@ -412,7 +413,7 @@ class Launch:
             if self._condition.home is None:
                 self._stated_reason = "its autopilot reports no home position"
                 return None
-            # The estimated altitude of the ground has drifted since home was set.
+            # The altitude of the ground in the estimate has drifted since home was set.
             ground = self._positions.origin[2] - self._condition.home_up
             altitude += self._condition.home[2] + ground
         self._lift_asked = True

@@ -4,10 +4,10 @@ The commanded velocity u of an axis gives two bounds of the real velocity, low a
 
     high(t) = max(g u of the last θ + 0.3 s, each with an error of a quarter;  high(t - Δt) - a Δt)
 
-and low likewise: a vehicle may follow at once, or as slowly as with a = 1 m/s² and 0.3 s later than
-its dead time θ. Wind and model errors explain a velocity outside these bounds up to a share of D =
-1 m/s + fence.wind_mps, over all axes. Beyond that somebody else commands the autopilot, or the
-autopilot has failed. The share is smaller if the deviation lasts longer:
+and low likewise. So a vehicle may follow at once, or as slowly as with the acceleration a = 1 m/s²,
+0.3 s later than its dead time θ. Wind and model errors explain a velocity outside these bounds up
+to a share of D = 1 m/s + fence.wind_mps, over all axes. Beyond that somebody else commands the
+autopilot, or the autopilot has failed. The share is smaller if the deviation lasts longer:
 
     D for 0.1 s;  3/4 D for 3 s;  1/5 D for 5 s while no command has the direction of the motion
 
@@ -29,7 +29,7 @@ from skytether.shared.fence.keys import FenceConfig
 from skytether.shared.scenario.schema import Scenario
 
 LATER_NS = 300 * MILLISECOND_NS
-"""Time after the model's dead time within which an input may begin to act."""
+"""Time after the model's dead time up to which an input may begin to act [ns]."""
 ERROR = 0.25
 SLOW_MPS2 = 1.0
 """Acceleration of the slowest vehicle [m/s²]."""
@@ -43,10 +43,10 @@ NOTICED = (
 """Rows: share of the allowed deviation, time for which the deviation has to exceed it, and largest
 command in the direction of motion for which the row applies [m/s]."""
 CALM_SHARE, QUIET_NS = 0.15, 500 * MILLISECOND_NS
-"""Share of the allowed deviation below which the deviation has to stay for QUIET_NS, until the
-vehicle counts as obedient again."""
+"""The vehicle counts as obedient again after the deviation has stayed below this share of the
+allowed deviation for QUIET_NS."""
 AGAIN_NS = 60 * SECOND_NS
-"""Time after the end of a disobedience within which a second one is final."""
+"""Time after the end of a disobedience within which a second disobedience is final [ns]."""
 COMMANDS_MAX = 256
 
 
@@ -65,7 +65,7 @@ class Obedience:
         """Time since which the deviation has been too large, by row of NOTICED; None if it is
         small."""
         self._restless_ns = 0
-        """Newest time at which the deviation was too large to count as obedient again."""
+        """Newest time at which the deviation was too large for an obedient vehicle [ns]."""
         self.strays = self._is_final = False
         self._ended_ns: int | None = None
         """Time at which the newest disobedience ended; None without one."""

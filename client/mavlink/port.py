@@ -24,7 +24,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 TICK_NS = 100 * MILLISECOND_NS
-"""Interval between two checks for messages that are due, other than set-points."""
+"""Interval between two checks for due messages; set-points have their own times [ns]."""
 HEARTBEAT_NS = SECOND_NS
 CLOSES = 3
 """Number of times that a vehicle in the air is commanded to land when the process ends."""
@@ -126,8 +126,8 @@ class Port(Endpoint):
             self._say(_heartbeat(dialect.MAV_TYPE_GCS))
 
     def _request_heartbeat(self) -> None:
-        """Request the first heartbeat. Without a request it may come a second later, but a client
-        restarted in flight has to send set-points earlier.
+        """Request the first heartbeat. Without a request the heartbeat may come a second later, and
+        a client that restarts in flight has to send set-points before that.
         """
         if self._connection.unmet is not None:
             peer, target = self._connection.unmet
@@ -146,8 +146,8 @@ class Port(Endpoint):
         """Whether the client also sends heartbeats of a ground station: PX4 sends its texts to
         ground stations only.
 
-        False if PX4 reacts to the loss of its ground station: PX4 would no longer notice the loss
-        of another station.
+        False if PX4 reacts to the loss of its ground station: if the client acted as one, PX4 would
+        no longer notice the loss of the real station.
         """
         parts = self.autopilot.parts
         return (

@@ -54,11 +54,11 @@ class Positions(positions.Positions):
         is_old = now_ns - self.came_ns > FRESH_NS
         if is_old or self.origin != self._origin_before:
             self._slides.begin()
-        if is_old:  # newer positions were dropped, so this one is much older than the fix
+        if is_old:  # newer positions were dropped, so `position` is much older than the fix
             return
         (north, east, _), (x, y, _) = self.position, self.origin
         slide = self._slides.slid((north - x, east - y), velocity, stamp_ns)
         if slide is not None:
-            # The operator is asked at the beginning of a slide, not again while it grows.
+            # The operator is asked when a slide begins, and not again while the slide grows.
             self.displace((*slide.by_m, 0.0), asks=slide.begins or self.leap_m is not None)
         self._origin_before = self.origin

@@ -1,7 +1,8 @@
 """Position receiver of an autopilot, from GPS_RAW_INT: whether it has a fix, and its velocity.
 
 After the last fix an autopilot flies on by its accelerometers for seconds before its flags report
-it. A vehicle whose receiver had no fix since the client's start has another position source.
+the loss of the fix. A vehicle whose receiver had no fix since the client's start has another
+position source.
 """
 
 import math
@@ -11,9 +12,9 @@ from skytether.mavlink.dialect import dialect
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 LOST_NS = 1500 * MILLISECOND_NS
-"""Time without a usable fix after which the fix counts as lost, unless fixes are rare."""
+"""Time without a usable fix after which the fix counts as lost [ns], unless fixes are rare."""
 FEWEST = 3
-"""Number of usual intervals without a fix after which the fix counts as lost."""
+"""Number of usual intervals between fixes after which, without a fix, the fix counts as lost."""
 INTERVAL_MAX_NS = 2 * SECOND_NS
 """Largest time between two fixes that counts as a usual interval."""
 UNHEARD_NS = SECOND_NS // 2
@@ -27,17 +28,17 @@ US_NS = 1000
 class Receiver:
     def __init__(self) -> None:
         self.stamp_ns = -1
-        """Time of the newest usable fix on the autopilot's clock; its arrival if it has no time
+        """Time of the newest usable fix on the autopilot's clock, or its arrival if it has no time
         stamp [ns]; -1 before the first fix."""
         self.velocity: tuple[float, float] | None = None
         """Velocity of the newest usable fix, north and east [m/s]; None if not measured."""
         self._fix_ns: int | None = None
-        """Start of the time without a fix [ns]: arrival of the newest fix, or later."""
+        """Start of the time without a fix [ns]: the newest fix, or the end of a later pause."""
         self._interval_ns = 0
 
     def hear(self, message: Message, *, now_ns: int) -> bool:
         """Process a GPS_RAW_INT; returns whether it has a new and usable fix."""
-        stamp_ns = message.time_usec * US_NS or now_ns  # 0: PX4 does not know the date yet
+        stamp_ns = message.time_usec * US_NS or now_ns  # PX4 sends 0 until it knows the date
         if not _is_usable(message) or stamp_ns == self.stamp_ns:
             return False
         if self._fix_ns is not None and now_ns - self._fix_ns <= INTERVAL_MAX_NS:

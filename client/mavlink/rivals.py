@@ -13,7 +13,7 @@ from skytether.shared.base.units import SECOND_NS
 WINDOW_NS = SECOND_NS
 """Window in which set-points are counted."""
 LEAST = 2
-"""Number of set-points in the window that reveal a second commander; a single one may be stray."""
+"""Number of set-points in the window that reveal a second commander; one may be an error."""
 QUIET_NS = 3 * SECOND_NS
 """Silence after which a second commander counts as gone."""
 STREAMS = frozenset(

@@ -4,7 +4,8 @@
 one second at most, and once the client's process has ended it has to come down; hovering or flying
 on for ever is unsafe.
 
-The autopilot is unsafe if it lacks a required parameter; other missing ones are only reported.
+The autopilot is unsafe if it lacks a required parameter; other missing parameters are only
+reported.
 """
 
 import math
@@ -25,8 +26,8 @@ TOLERANCE = 1e-6
 
 
 def returns_below_m(scenario: Scenario) -> float | None:
-    """Altitude below which a vehicle without a link returns home [m], infinite without a fence;
-    None if the vehicle lands in place.
+    """Altitude of the fence, below which a vehicle without a link has to return home [m]; infinite
+    without a fence. None if the vehicle lands in place.
     """
     if scenario.vehicle.on_loss != "return":
         return None
@@ -292,8 +293,8 @@ def _limit(value: float, where: str) -> str:
 
 
 def judged(rule: Rule, values: Mapping[str, float]) -> AutopilotParameter:
-    """Parameter of a rule, its meaning, and whether it is safe; `values` are the autopilot's
-    parameters by name.
+    """Parameter of a rule, the meaning of its value, and whether the value is safe; `values`:
+    values of the autopilot's parameters by name.
     """
     for name in rule.names:
         value = values.get(name)

@@ -13,13 +13,13 @@ from skytether.mavlink.frames import turned
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 UNFLOWN_NS = 500 * MILLISECOND_NS
-"""Time after which a silent pilot counts as gone; then no set-point is sent."""
+"""Time without a command of the pilot (`client.pilot`) after which no set-point is sent [ns]."""
 SETPOINTS_MIN_HZ, SETPOINTS_MAX_HZ = 20, 50.0
 CURRENT_NS = 300 * MILLISECOND_NS
-"""Time after a pause of set-points before a heartbeat counts as current: an earlier heartbeat may
-have waited in a queue."""
+"""Only a heartbeat that arrives later than this after a pause of set-points counts as current [ns]:
+an earlier one may have waited in a queue."""
 LATE = 1.1
-"""Number of intervals after which a set-point is repeated; above 1, because steps may be late."""
+"""Time after which a set-point is repeated, in nominal intervals; above 1, as steps may be late."""
 ZERO_NS = 50 * MILLISECOND_NS
 """Interval between zero set-points, if a mode needs a stream of them."""
 VELOCITY_ALONE = 0b110111000111
@@ -46,11 +46,11 @@ class Setpoints:
         self._flown_ns: int | None = None
         self._sent_ns: int | None = None
         self._mode_awaited_ns: int | None = None
-        """Start of the wait for a heartbeat with the mode after a pause; None without a wait."""
+        """Start of the wait for a heartbeat after a pause [ns]; None without a wait."""
         self.count = 0
 
     def command(self, velocity: Vector, *, now_ns: int) -> bool:
-        """Adopt the pilot's command; return whether to send it now: at most SETPOINTS_MAX_HZ."""
+        """Adopt the pilot's command; return whether SETPOINTS_MAX_HZ allows to send it now."""
         self._velocity, self._flown_ns = velocity, now_ns
         least_ns = SECOND_NS / SETPOINTS_MAX_HZ
         return self._sent_ns is None or now_ns - self._sent_ns >= 0.9 * least_ns
@@ -70,7 +70,7 @@ class Setpoints:
         """Velocity to be sent now, north, east and up [m/s]; None if none may be sent.
 
         After a pause the autopilot may have left its guided mode, and a set-point would switch it
-        back to this mode. So a heartbeat with the present mode has to arrive first.
+        back to this mode. So a heartbeat with the present mode has to arrive before it.
 
         Args:
             leaves_ns: pause after which the autopilot leaves its guided mode [ns]; None if a

@@ -2,8 +2,8 @@
 
     heartbeat → version → parameters, read one by one → all safe, or refused, or set and read again
 
-Each question is repeated until it is answered, often enough for a bad line. A parameter that is
-never answered counts as one that the autopilot does not have.
+A question is repeated until it is answered, up to TRIES times, because the line may be bad. If no
+answer arrives, the autopilot counts as lacking the parameter.
 """
 
 from collections.abc import Mapping
@@ -116,7 +116,7 @@ class Setup:
             self._changed.append((name, before, value))
         self._values[name], self._kinds[name] = value, kind
         for rule in self._rules:
-            if name in rule.names:  # an autopilot has a parameter under one name only
+            if name in rule.names:  # the autopilot has the parameter under this name only
                 for other_name in rule.names:
                     self._tries.pop(other_name, None)
 

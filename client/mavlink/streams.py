@@ -15,7 +15,7 @@ HEARTBEAT = int(dialect.MAVLINK_MSG_ID_HEARTBEAT)
 SHARE = 0.7
 """Share of the requested rate at which a stream counts as present."""
 WINDOW_NS = 2 * SECOND_NS
-"""Shortest window in which messages are counted; longer if LEAST messages need more time."""
+"""Shortest window in which messages are counted [ns]; longer if LEAST messages take more time."""
 LEAST = 3.0
 BACK_OFF_MAX = 8
 """Longest window of a missing stream, as a multiple of its shortest window."""
@@ -60,7 +60,7 @@ class _Stream:
         self.window_ns = 0
         """Length of the present window [ns]; 0 before the first window."""
         self.until_ns = 0
-        """End of the window; the stream is then requested again unless enough messages arrived."""
+        """End of the window [ns]; a stream with too few messages is then requested again."""
 
 
 class Streams:
@@ -76,7 +76,7 @@ class Streams:
         self.newest = ""
         self._streams = {number: _Stream(rate) for number, rate in rates.items()}
         self._heartbeat_ns = 0
-        """Time of the next request for a heartbeat, if each one is requested."""
+        """Time of the next request for a heartbeat [ns], if heartbeats are requested one by one."""
 
     def hear(self, number: int) -> None:
         if number in self._streams:

@@ -34,7 +34,7 @@ class Timesync:
 
     def hear(self, message: Message, *, now_ns: int) -> bool:
         """Process an answer; returns whether it shows that the autopilot has restarted."""
-        if message.tc1 == 0:  # a request of the autopilot: PX4 sends ten a second
+        if message.tc1 == 0:  # PX4 also sends requests of its own, ten a second
             return False
         clock = self._clock
         self.untimely += not clock.hear(message.tc1, message.ts1, now_ns=now_ns)
@@ -44,7 +44,7 @@ class Timesync:
         return True
 
     def ask(self, *, is_heard: bool, now_ns: int) -> list[Message]:
-        """Question, if one is due. Reports an autopilot that sends messages but no answers."""
+        """Request for the time, if due. Reports an autopilot that answers no such request."""
         clock, was_reported = self._clock, self._reported_silent
         silent_ns = now_ns - clock.heard_ns if clock.is_known and is_heard else 0
         self._reported_silent = silent_ns > SILENT_NS

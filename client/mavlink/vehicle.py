@@ -66,7 +66,7 @@ class MavlinkVehicle(Vehicle):
         return self._autopilot.waits_for
 
     def take_off(self, *, now_ns: int) -> bool:
-        """Take off; a vehicle on the ground is armed only if the scenario's key `armed` is true."""
+        """Take off; the client arms a vehicle on the ground only if the key `armed` is true."""
         return self._port.take_off(may_arm=self._may_arm, now_ns=now_ns)
 
     def is_up(self, *, now_ns: int) -> bool:

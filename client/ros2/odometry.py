@@ -5,8 +5,8 @@ A robot answers no questions about its clock, so only the arrivals of messages s
     the fastest message of an interval, stamped b, arrives at t, after at most ROUND_TRIP_NS:
     offset = t - ROUND_TRIP_NS / 2 - b
 
-This sample is used like the answer of an autopilot (`client.clock`). A delay that all messages have
-cannot be detected; measurements then count as younger by this delay.
+This sample is used like the answer of an autopilot (`client.clock`). A delay common to all messages
+cannot be detected: measurements then seem younger by this delay.
 """
 
 from skytether.client.clock import BootClock

@@ -227,7 +227,7 @@ class Port(Endpoint):
                 self._command(ZERO)
 
     def figures(self) -> dict[str, Any]:
-        """Figures with the names that an autopilot's have, so that the same metrics show them."""
+        """Figures under the names of an autopilot's figures, so that the same metrics show them."""
         return {
             "measurements": self.odometry.positions.taken,
             "heard": self.odometry.heard,
@@ -239,7 +239,7 @@ class Port(Endpoint):
 
 
 def _instead(others: Sequence[Entity], expected: Iterable[Topic]) -> str:
-    """Mismatch between found and expected types, in words; empty if no type was found."""
+    """Message that the type found differs from the expected one; empty if no type was found."""
     if not others:
         return ""
     hashes = " or ".join(topic.type_hash for topic in expected)

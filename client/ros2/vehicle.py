@@ -33,7 +33,7 @@ class Ros2Vehicle(Vehicle):
         self.node = self._port.node
         self._positions = self._port.odometry.positions
         self._placed = 0
-        """Number of measurements used before the origin was set; the flight needs a later one."""
+        """Number of measurements before the origin was set; a flight begins after a later one."""
 
     def fly(self, velocity: Array) -> None:
         x, y, *up = velocity.tolist()

@@ -70,7 +70,7 @@ class Weather:
         """
         if self._white is None:
             return
-        # With gusts, not drawn in advance: gusts draw from the same stream between two steps.
+        # With gusts the numbers are drawn now, because gusts use the same stream between two steps.
         gusty = self._gust_mps2 != 0.0
         drawn = self._rng.standard_normal(x.shape) if gusty else self._normals.next()
         shoved(x, self._white, drawn)

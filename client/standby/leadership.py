@@ -66,14 +66,14 @@ class Leadership:
         return now_ns - heard_ns[self.leader] >= self._ask_ns
 
     def successor(self, heard_ns: Sequence[int], now_ns: int) -> int | None:
-        """Server that replaces a silent leader; None if the leader is not silent, or if no server
-        that may lead answers.
+        """Server that replaces a silent leader. None if the leader is not silent, or if no server
+        that is allowed to lead was heard after the leader fell silent.
         """
         last_ns = heard_ns[self.leader]
         if now_ns - last_ns < self._change_ns:
             return None
         newest = max(filter(self.may_lead, range(self._servers)), key=heard_ns.__getitem__)
-        # The server was heard after the leader fell silent: otherwise both may be unreachable.
+        # A server last heard before the leader fell silent may be unreachable for the same reason.
         return newest if heard_ns[newest] >= last_ns + self._ask_ns else None
 
     def hand_over(self, server: int) -> None:

@@ -225,7 +225,7 @@ class Servers(OneServer):
         return True
 
     def _is_alone(self, now_ns: int) -> bool:
-        """Whether none of the other servers that may lead answers."""
+        """Whether no other server that may lead answers."""
         may_lead = filter(self.leadership.may_lead, range(self._count))
         return all(
             self.sessions[i].role.is_followed or self.sessions[i].is_lost(now_ns) for i in may_lead
@@ -310,7 +310,7 @@ class OneOfServers(Role):
         return self._servers.take(self._server, message, now_ns)
 
     def lost_after_ns(self, timeout_ns: int) -> int:
-        """See `Role`; the result is shorter than the time in which a server forgets a session."""
+        """See `Role`; less than the time after which a server forgets a session."""
         if self.is_followed:
             return timeout_ns
         return max(timeout_ns, min(LOST_TIMES * timeout_ns, SESSION_NS // 2))
