@@ -121,7 +121,7 @@ class OneServer:
         """Act on an operator's change of `keys`."""
 
     def to_keep(self) -> dict[str, Any]:
-        """Fields of `memory.SavedState` that the servers provide: value by name."""
+        """Values that the servers add to `memory.SavedState`, by the field's name."""
         return {}
 
     def figures(self) -> dict[str, Any]:

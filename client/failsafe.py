@@ -33,7 +33,7 @@ WINDOW_NS = SECOND_NS
 MALFORMED_MAX = 5
 """Number of malformed messages within `WINDOW_NS` that make the vehicle brake."""
 FUTURE_MAX = 10
-"""Number of plans from the future within `WINDOW_NS` after which the client opens a new session."""
+"""Number of impossible plans (`Failsafe.future`) in `WINDOW_NS` that make the client reconnect."""
 BRAKE_SPARE_NS = 500 * MILLISECOND_NS
 """Margin added to the computed time of braking [ns]."""
 
@@ -230,7 +230,7 @@ class Failsafe:
         """Whether an operator has chosen that the vehicle hovers on after a leap instead of
         landing."""
         self._future: deque[int] = deque(maxlen=FUTURE_MAX)
-        """Times at which the newest plans from the future arrived."""
+        """Times at which the newest impossible plans arrived, see `future`."""
         self.keeps_motion = False
         """Whether a mission's motion is in force and its last knot is still ahead."""
         self.postponed: Reason | None = None
@@ -309,7 +309,7 @@ class Failsafe:
     # -- timers ------------------------------------------------------------------------------
 
     def step(self, *, late_ns: int, hindrance: Reason | None, now_ns: int) -> None:
-        """Handle the causes that hold at the start of a step.
+        """React to lateness, a hindrance, silence and an old plan at the start of a step.
 
         Args:
             late_ns: delay with which the step was started [ns].

@@ -31,7 +31,7 @@ from skytether.shared.fence.margins import SLOW_STEPS, inner_bounds
 from skytether.shared.scenario.schema import Scenario
 
 ROUNDING = 1e-9
-"""Change of an input attributed to rounding [m/s]."""
+"""Largest change of an input that is attributed to rounding [m/s]."""
 
 
 class Fence:

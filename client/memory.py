@@ -189,7 +189,7 @@ class ClientMemory:
         return state.encode(now_ns)
 
     def kept(self, *, nothing: bool) -> None:
-        """Note that the bytes returned last were written; `nothing`: that the file was removed."""
+        """Note that the bytes of `keep` were written; `nothing`: the file was removed instead."""
         self._is_removed = nothing
         self._saved = self._handed[0] if self._handed and not nothing else None
 

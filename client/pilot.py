@@ -94,7 +94,7 @@ class Pilot:
         """Time at which the next step begins [ns]; None before the flight."""
         self.step = 0
         self.flown = 0
-        """Present step; measurements up to its start are included."""
+        """Step flown last; the estimate includes all measurements up to its start."""
         self._flown_ns = 0
         self._takes_from: int | None = None
         """Step of the first observation that announced that plans are accepted; None while plans
@@ -307,9 +307,8 @@ class Pilot:
         """Input of the present step: the compensator's input, bounded by mode, clamp and fence.
 
         Returns:
-            input of each axis [m/s]; speed at which the braking curve continues at the next step
-                [m/s]; and whether
-            the compensator's input is finite: if not, the returned input is zero.
+            input of each axis [m/s]; speed at which braking continues at the next step [m/s]; and
+            whether the compensator's input is finite: if not, the returned input is zero.
         """
         mode, terms, compensator = self._failsafe.mode, self._terms, self.compensator
         navigation, had_plan = self._navigation, compensator.covered

@@ -13,8 +13,8 @@ from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import stamped_ns
 
 SLEPT_NS = JUMP_NS // 2
-"""If the server's clock gains more than this on the client's [ns], this machine was suspended;
-changes of the delay cause far less."""
+"""Gain of the server's clock on the client's above which this machine was suspended [ns]; changes
+of the delay cause far less."""
 
 
 class Echo(NamedTuple):

@@ -203,7 +203,7 @@ class ServerSession:
         try:
             return self.role.decode(payload, self._terms)
         except ProtocolError:
-            # Plaintext does not count: anybody could make the vehicle brake with five packets.
+            # Malformed plaintext does not count: anybody could make the vehicle brake with it.
             if self.link.secure:
                 self.role.malformed(now_ns=now_ns)
             raise

@@ -2,11 +2,11 @@
 
     GROUND → CLIMBING (the steps of its flavour, one after another) → FLYING → LANDING → down
 
-A step is done when the autopilot's state shows the result; until then the step's command is
-repeated. A vehicle is armed only on the ground and only if `armed` is set in the scenario. A mode
-chosen by somebody else is not changed: once the vehicle is armed, the client replaces only a mode
-that it has set, or to which its take-off command led. A pilot returns control to the client by
-choosing the mode that follows set-points.
+A step is done when the autopilot's state shows it; until then the step's command is repeated. A
+vehicle is armed only on the ground and only if `armed` is set in the scenario. A mode chosen by
+somebody else is not changed: once the vehicle is armed, the client replaces only a mode that it has
+set, or to which its take-off command led. A pilot returns control to the client by choosing the
+mode that follows set-points.
 
 A vehicle that an earlier run of the client, or somebody else, has armed is not armed again before
 an operator allows arming: a process restarted after a landing must not make the vehicle take off. A
@@ -401,7 +401,7 @@ class Launch:
         return self._lift() if step is LaunchStep.LIFT else None
 
     def _come_down(self, now_ns: int) -> Message:
-        """Command to land or to return; a vehicle that ignores the command to return lands."""
+        """Command to land or to return; after an ignored command to return, the command to land."""
         assert self._since_ns is not None
         if now_ns - self._since_ns > REFUSED_NS:
             self._landing_mode = self._flavour.land

@@ -43,8 +43,8 @@ NOTICED = (
 """Rows: share of the allowed deviation, time for which the deviation has to exceed it, and largest
 command in the direction of motion for which the row applies [m/s]."""
 CALM_SHARE, QUIET_NS = 0.15, 500 * MILLISECOND_NS
-"""The vehicle counts as obedient again after the deviation has stayed below this share of the
-allowed deviation for QUIET_NS."""
+"""Share of the allowed deviation, and time for which the deviation must stay below this share
+before the vehicle counts as obedient again."""
 AGAIN_NS = 60 * SECOND_NS
 """Time after the end of a disobedience within which a second disobedience is final [ns]."""
 COMMANDS_MAX = 256

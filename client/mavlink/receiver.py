@@ -14,7 +14,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 LOST_NS = 1500 * MILLISECOND_NS
 """Time without a usable fix after which the fix counts as lost [ns], unless fixes are rare."""
 FEWEST = 3
-"""Number of usual intervals between fixes after which, without a fix, the fix counts as lost."""
+"""Number of usual intervals for which no fix may arrive before the fix counts as lost."""
 INTERVAL_MAX_NS = 2 * SECOND_NS
 """Largest time between two fixes that counts as a usual interval."""
 UNHEARD_NS = SECOND_NS // 2

@@ -16,8 +16,8 @@ UNFLOWN_NS = 500 * MILLISECOND_NS
 """Time without a command of the pilot (`client.pilot`) after which no set-point is sent [ns]."""
 SETPOINTS_MIN_HZ, SETPOINTS_MAX_HZ = 20, 50.0
 CURRENT_NS = 300 * MILLISECOND_NS
-"""Only a heartbeat that arrives later than this after a pause of set-points counts as current [ns]:
-an earlier one may have waited in a queue."""
+"""Time after a pause of set-points from which on a heartbeat counts as current [ns]; an earlier
+heartbeat may have waited in a queue."""
 LATE = 1.1
 """Time after which a set-point is repeated, in nominal intervals; above 1, as steps may be late."""
 ZERO_NS = 50 * MILLISECOND_NS
@@ -50,7 +50,7 @@ class Setpoints:
         self.count = 0
 
     def command(self, velocity: Vector, *, now_ns: int) -> bool:
-        """Adopt the pilot's command; return whether SETPOINTS_MAX_HZ allows to send it now."""
+        """Adopt the pilot's command; return whether SETPOINTS_MAX_HZ allows sending it now."""
         self._velocity, self._flown_ns = velocity, now_ns
         least_ns = SECOND_NS / SETPOINTS_MAX_HZ
         return self._sent_ns is None or now_ns - self._sent_ns >= 0.9 * least_ns
@@ -70,7 +70,7 @@ class Setpoints:
         """Velocity to be sent now, north, east and up [m/s]; None if none may be sent.
 
         After a pause the autopilot may have left its guided mode, and a set-point would switch it
-        back to this mode. So a heartbeat with the present mode has to arrive before it.
+        back to this mode. So a heartbeat has to show the present mode before the next set-point.
 
         Args:
             leaves_ns: pause after which the autopilot leaves its guided mode [ns]; None if a

@@ -67,7 +67,7 @@ class Setup:
         self._version: str | None = None
         self._version_tries = 0
         self._tries: dict[str, int] = {name: 0 for rule in self._rules for name in rule.names}
-        """Number of attempts to read or set each parameter that is not settled yet."""
+        """Number of attempts to read or set each parameter whose value is still awaited."""
         self._values: dict[str, float] = {}
         self._kinds: dict[str, int] = {}
         self._setting: dict[str, tuple[float, float]] = {}

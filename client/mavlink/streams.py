@@ -20,7 +20,7 @@ LEAST = 3.0
 BACK_OFF_MAX = 8
 """Longest window of a missing stream, as a multiple of its shortest window."""
 HEARTBEAT_HZ = 5.0
-"""Rate of heartbeats [Hz], which show when a pilot switches the mode."""
+"""Requested rate of heartbeats [Hz]; they show when a pilot switches the mode."""
 RATES = {
     int(dialect.MAVLINK_MSG_ID_EXTENDED_SYS_STATE): 5.0,
     int(dialect.MAVLINK_MSG_ID_ATTITUDE): 10.0,
@@ -33,7 +33,7 @@ RATES = {
 
 
 def rates(flavour: Flavour, positions_hz: float) -> dict[int, float]:
-    """Requested rate of each message [Hz], by its number; `positions_hz` is that of positions."""
+    """Requested rate of each message [Hz], by its number; `positions_hz`: rate of positions."""
     estimate = (
         dialect.MAVLINK_MSG_ID_EKF_STATUS_REPORT
         if flavour is ARDUPILOT

@@ -19,7 +19,7 @@ from skytether.shared.scenario.schema import Scenario
 from skytether.shared.telemetry.record import Reason
 
 PLANE_ALTITUDE_M = 3.0
-"""Altitude at which a vehicle is flown in the plane [m]."""
+"""Altitude of the flight of a vehicle with two axes [m]."""
 ORIGIN = keys_of(keys.ORIGIN)
 ALTITUDE_MIN_M = 0.5
 

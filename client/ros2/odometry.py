@@ -20,7 +20,7 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.scenario.schema import Scenario
 
 ROUND_TRIP_NS = 4 * MILLISECOND_NS
-"""Assumed bound of the delay of an interval's fastest message: small, as the client runs aboard."""
+"""Assumed largest delay of an interval's fastest message [ns]; small, as the client is aboard."""
 BEGIN_NS, INTERVAL_NS = 100 * MILLISECOND_NS, SECOND_NS
 """Interval between two clock samples before the clock is known, and afterwards."""
 
