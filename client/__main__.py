@@ -93,8 +93,8 @@ class ClientOptions(ProcessOptions):
     """Accept a plaintext link to another machine: anybody on the network between the two machines
     can then fly the vehicle."""
     json: Path | None = None
-    """File for the client's summary of the flight, or for counters and CPU time if it flies several
-    vehicles."""
+    """File for the client's summary of the flight, or for counters and CPU time if the client flies
+    several vehicles."""
     new_flight: bool = False
     """Begin a new flight: ignore what an earlier run saved in `vehicle.memory` and what was set in
     flight. Give --new-flight by hand only, never in the command of a service."""

@@ -99,7 +99,7 @@ class OneServer:
         self.sessions: list[Any] = []
         """Session with each server, appended by the caller."""
         self.may_tell: Callable[[int], bool] = lambda _: True
-        """Whether messages may be sent at a time [ns]; replaced if the client saves its state."""
+        """Function that says whether messages may be sent at a time [ns]; see `client.memory`."""
 
     @property
     def followed(self) -> Any:

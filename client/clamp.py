@@ -1,8 +1,8 @@
 """Last bound on every input, independent of the part of the client that chose the input.
 
-It shares no code with packet decoding or the choice of the input, so an error there does not
-disable it. Only the fence acts after it, because an input that leads back inside the fence may have
-to change faster than this bound allows.
+The clamp shares no code with packet decoding or the choice of the input, so an error in these does
+not disable the clamp. Only the fence acts later, because an input that leads back inside the fence
+may have to change faster than this bound allows.
 """
 
 import math

@@ -27,7 +27,7 @@ KNOWN = 4
 ASKED_MAX = 16
 """Largest number of unanswered questions; older questions are discarded."""
 ROUND_TRIP_MAX_NS = SECOND_NS
-"""Longest round trip of an answer that is used, for an autopilot aboard."""
+"""Longest usable round trip of an answer, for an autopilot aboard [ns]."""
 SPREAD_NS = MILLISECOND_NS
 """Margin: a round trip is usable up to 1.5 times the shortest one plus SPREAD_NS [ns]."""
 DRIFT_SPAN_NS = 10 * SECOND_NS

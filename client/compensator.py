@@ -46,7 +46,7 @@ class Compensator:
         self.begins = 0
         """Step of stage 0: the plan's first step, or the step at which the plan was dropped."""
         self.follower: Follower = self._braking(np.zeros(terms.axes))
-        """Follower of the plan in force; without a plan, braking or holding a position."""
+        """Follower of the plan in force; without a plan, one that brakes or holds a position."""
         self._chosen = 0
         self.in_force = NO_HORIZON
         """Step that the plan in force was made for, or NO_HORIZON."""
@@ -117,7 +117,7 @@ class Compensator:
         *,
         since: int | None = None,
     ) -> None:
-        """Put a spline in force, newly received or accepted by an earlier run of this client.
+        """Put a spline in force that has just arrived, or that an earlier run of the client flew.
 
         Args:
             made_for: step of the first knot.

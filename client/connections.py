@@ -11,7 +11,7 @@ Ends = dict[tuple[int, Address], tuple[ServerSession, int]]
 
 
 def connect(reach: Reach, parts: Parts) -> tuple[OneServer, Ends]:
-    """Servers of a vehicle, each with a session that waits to be opened.
+    """Servers of a vehicle, each with a session that is not open yet.
 
     Raises:
         ConfigError: see `Reach.servers`.

@@ -168,7 +168,7 @@ class Client(Endpoint):
         return self._pilot.disturbance
 
     def receive(self, datagram: Datagram, *, now_ns: int) -> None:
-        """Process a datagram of this session; drop and count any other.
+        """Process a datagram of this session; drop and count any other datagram.
 
         Datagrams on the socket of the vehicle's own port are passed on to that port.
         """

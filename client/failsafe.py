@@ -210,7 +210,7 @@ class Failsafe:
         """Cause that ends hovering after a long silence of the server."""
         self.transitions: list[Transition] = []
         """Transitions on which the pilot has not acted yet, oldest first. The pilot acts after each
-        packet and in each step, so the list is short: 5 at most, in tests under faults."""
+        packet and in each step, so the list is short: at most 5 in tests with faults."""
         self.mode = Mode.INIT
         self.reason = Reason.BEGUN
         """Newest cause that changed mode or reason; while hovering, why the vehicle braked."""
@@ -274,7 +274,7 @@ class Failsafe:
         """Continue the flight of an earlier run.
 
         Args:
-            cause: RESUMED if that run's motion is continued, LOST if there is none.
+            cause: RESUMED if that run's motion is continued, LOST if there is no motion.
             heard_ns: time at which that run last received a packet from the server.
         """
         self._heard_ns = self._good_ns = self._horizon_ns = heard_ns
@@ -315,7 +315,7 @@ class Failsafe:
             late_ns: delay with which the step was started [ns].
             hindrance: cause on the vehicle's side that forbids following a plan.
         """
-        # The hindrance first: when a pilot takes over, no later check may act before that.
+        # The hindrance is checked first, so that no other cause acts before a pilot's take-over.
         if hindrance is not None:
             self.meet(hindrance, now_ns=now_ns)
         elif self.mode is Mode.MANUAL:
@@ -407,7 +407,7 @@ class Failsafe:
 
 
 def _full(times_ns: deque[int], now_ns: int) -> bool:
-    """Add a time; return whether the queue is full of times within WINDOW_NS, and then empty it."""
+    """Add a time. If the queue is now full of times within WINDOW_NS, empty it and return True."""
     times_ns.append(now_ns)
     full = len(times_ns) == times_ns.maxlen and now_ns - times_ns[0] <= WINDOW_NS
     if full:

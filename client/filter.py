@@ -175,7 +175,7 @@ class Kalman:
             self._late[:] = [each.late for each in rooms.dead_time().dead_times(terms)]
 
     def begin(self, measured: Measurement, numbers: Array) -> None:
-        """Start from the first measurement, which must have a position; the vehicle is at rest.
+        """Start from the first measurement, which must have a position; v is 0 if not measured.
 
         Args:
             measured: the measurement.

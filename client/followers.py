@@ -100,8 +100,8 @@ class HorizonFollower:
         last = self._inputs[:, length - 1].tolist()
         within = [bounded(u, bound) for u, bound in zip(last, terms.u_max, strict=True)]
         self._table[:, rule.LENGTH], self._table[:, rule.FEEDS_BACK] = length, self.feeds_back
-        # Not math.hypot: in 17 % of cases it is rounded differently from the square root in the
-        # server's replay.
+        # math.hypot is not used: in 17 % of cases it is rounded differently from the square root in
+        # the server's replay.
         self._table[:, rule.SPEED] = math.sqrt(sum(u * u for u in within))
         self.reference = np.zeros((terms.axes, 2))
         """Reference state x̄ of the feedback at the newest stage [m, m/s]; shape (axes, 2)."""

@@ -152,8 +152,8 @@ class Navigation:
     def _carried(self, measured: Measurement, to_ns: int, due: Array) -> Measurement:
         """Measurement extrapolated by the model to a later time; unchanged if the time is earlier.
 
-        A real vehicle measures between steps. The extrapolation assumes the input `due`; if another
-        input acted during part of it, the filter corrects the error.
+        A real vehicle measures between steps. The extrapolation assumes the input `due`. If another
+        input acted for part of the time, the filter corrects the error.
 
         Args:
             measured: the measurement.
@@ -202,7 +202,7 @@ class Leaps:
         self._position_ns = self._velocity_ns = 0
 
     def leaps(self, measured: Measurement, numbers: Array) -> bool:
-        """Store a measurement; return whether no vehicle could have moved to it since the last one.
+        """Store a measurement; return whether it is too far from the last one for any vehicle.
 
         Args:
             measured: the measurement.
@@ -246,7 +246,7 @@ def has_leapt(
     noise_m: float,
     noise_mps: float,
 ) -> bool:
-    """Whether no vehicle could have moved to a measurement since the last one; False for NaN.
+    """Whether a measurement is farther from the last one than a vehicle can move; False for NaN.
 
     Args:
         position, velocity: previous measurement of each axis [m], [m/s].

@@ -1,7 +1,7 @@
 """The route from a vehicle to a server over several paths, each an address with a socket.
 
-`client.several` uses it in place of `client.route.Route` for a server with several addresses.
-`shared.wire.paths` chooses the paths of each message.
+`client.several` uses this route in place of `client.route.Route` for a server with several
+addresses. `shared.wire.paths` chooses the paths of each message.
 """
 
 from collections.abc import Callable, Sequence

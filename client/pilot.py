@@ -132,7 +132,7 @@ class Pilot:
         return self._epoch_ns + step * self._dt_ns
 
     def begin(self, *, now_ns: int, began_ns: int | None = None) -> None:
-        """Begin the flight, or continue an earlier run's: `began_ns` is the start of step 0."""
+        """Begin the flight, or continue an earlier run's; `began_ns`: start of step 0 [ns]."""
         if began_ns is None:
             self._epoch_ns = self.next_ns = now_ns
             self._navigate(0)

@@ -79,7 +79,7 @@ class Positions:
         """Stamp of the newest measurement [ns; the client's clock]."""
         self._leaps = leaps
         self.is_flown = False
-        """Whether the pilot flies by these measurements, so that a leap matters."""
+        """Whether the pilot flies by these measurements; otherwise leaps have no effect."""
         self.leap_m: Vector | None = None
         """Displacement of the position about which no operator has decided yet, z up [m]; None
         without a leap. The origin has been displaced by the same vector, so the vehicle keeps its
@@ -91,7 +91,7 @@ class Positions:
         self.is_recalled = False
         """Whether the origin was saved by an earlier run since this boot of the autopilot."""
         self._recalled: VehicleMemory | None = None
-        """State saved by an earlier run, until it is checked for a reboot of the autopilot."""
+        """Saved state of an earlier run, until it is known whether the autopilot has rebooted."""
         self._boot_ns = 0
         """Time from the autopilot's boot to the newest measurement that was used [ns]."""
         self.position: Vector | None = None

@@ -56,7 +56,7 @@ class VehicleMemory(msgspec.Struct, frozen=True, kw_only=True):
     origin: tuple[Coordinate, Coordinate, Coordinate] | None = None
     """Origin of the scenario's frame in the autopilot's local frame, z up [m]; None if unknown."""
     leap_m: tuple[Coordinate, Coordinate, Coordinate] | None = None
-    """Part of `origin` due to a leap about which no operator has decided yet [m], see
+    """Part of `origin` that comes from a leap about which no operator has decided yet [m], see
     `Vehicle.leap_m`."""
     boot_ms: Annotated[int, msgspec.Meta(ge=0, lt=2**32)] = 0
     """Time since the autopilot's boot at which the fields above were last valid [ms]."""
@@ -145,7 +145,7 @@ class Vehicle(ABC):
         return False
 
     def return_home(self) -> None:  # noqa: B027 - optional
-        """Return home without commands and land there; only called if `returns` is True."""
+        """Return home and land there without further commands; only called if `returns` is True."""
 
     @property
     def is_down(self) -> bool:

@@ -180,7 +180,7 @@ class Autopilot:
         self.parts = Parts(setup, launch, streams)
 
     def hear(self, message: Message, *, now_ns: int) -> None:
-        """Process a message of the autopilot; ignored if the autopilot is unsuitable."""
+        """Process a message of the autopilot, or ignore it if the autopilot is unsuitable."""
         if self.parts is None:
             return
         condition, (setup, launch, streams) = self.condition, self.parts

@@ -16,7 +16,7 @@ briefly under thrust."""
 FRESH_NS = 2500 * MILLISECOND_NS
 """Age up to which a heartbeat counts as current [ns]; so long that one heartbeat may be lost."""
 NUMBERS = 256
-"""Range of the sequence numbers of frames, which wrap around."""
+"""Number of different sequence numbers of frames; after the last one they begin again at 0."""
 OVERTAKEN_NS = SECOND_NS
 """Longest time for which a frame with a lower number counts as overtaken; after a longer pause its
 sender may have restarted."""
@@ -25,7 +25,7 @@ KNOWS = dialect.ESTIMATOR_VELOCITY_HORIZ
 PLACED = dialect.ESTIMATOR_POS_HORIZ_ABS | dialect.ESTIMATOR_POS_HORIZ_REL
 """Flags of an estimate with a valid position; one is enough."""
 STANDS_IN = dialect.ESTIMATOR_CONST_POS_MODE
-"""Flag of an estimate that assumes a vehicle at rest, for lack of data."""
+"""Flag of an estimate that, for lack of data, assumes that the vehicle is at rest."""
 UNKNOWN_MV, UNKNOWN_PERCENT = 65535, -1
 BATTERY_BAD = range(
     int(dialect.MAV_BATTERY_CHARGE_STATE_LOW), int(dialect.MAV_BATTERY_CHARGE_STATE_UNHEALTHY) + 1
@@ -59,10 +59,10 @@ class Condition:
         self.home_up = 0.0
         """Altitude of home in the autopilot's local frame [m]."""
         self._is_bad: dict[str, bool] = {}
-        """Whether the estimate is bad, by the type of the message that reports it."""
+        """Whether the estimate is bad according to each type of message that reports on it."""
         self._astray_ns: int | None = None
         self._is_low: dict[str, bool] = {}
-        """Whether the battery is low, by the type of the message that reports it."""
+        """Whether the battery is low according to each type of message that reports on it."""
         self._low_ns: int | None = None
         self.receiver = Receiver()
         self.has_new_fix = False

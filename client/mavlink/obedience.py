@@ -40,8 +40,8 @@ NOTICED = (
     (0.75, 3 * SECOND_NS, math.inf),
     (0.2, 5 * SECOND_NS, 0.1),
 )
-"""Rows: share of the allowed deviation, time for which the deviation has to exceed it, and largest
-command in the direction of motion for which the row applies [m/s]."""
+"""Rows: share of the allowed deviation, time for which the deviation has to exceed this share [ns],
+and largest command in the direction of motion for which the row applies [m/s]."""
 CALM_SHARE, QUIET_NS = 0.15, 500 * MILLISECOND_NS
 """Share of the allowed deviation, and time for which the deviation must stay below this share
 before the vehicle counts as obedient again."""

@@ -1,7 +1,7 @@
 """Position receiver of an autopilot, from GPS_RAW_INT: whether it has a fix, and its velocity.
 
 After the last fix an autopilot flies on by its accelerometers for seconds before its flags report
-the loss of the fix. A vehicle whose receiver had no fix since the client's start has another
+the loss of the fix. If the receiver had no fix since the client's start, the vehicle has another
 position source.
 """
 

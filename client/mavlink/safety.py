@@ -120,7 +120,7 @@ def _below(value: float, below_m: float) -> bool:
 
 
 def _returning(name: str, what: str, below_m: float, scale: float) -> Rule:
-    """Rule for a parameter that has to be below the fence: an altitude of the return home.
+    """Rule for a parameter that is an altitude of the return home, which must be below the fence.
 
     Args:
         what: what the vehicle does at that altitude, such as "returns home".

@@ -156,7 +156,7 @@ class Setup:
         return [request(self._target, VERSION)]
 
     def _question(self, name: str) -> Message:
-        """Message that reads a parameter, or sets it; the answer is its value in both cases."""
+        """Message that reads or sets a parameter; the answer to both is the parameter's value."""
         if name not in self._setting:
             return dialect.MAVLink_param_request_read_message(*self._target, name.encode(), -1)
         kind, (_, wanted) = self._kinds[name], self._setting[name]

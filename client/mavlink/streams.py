@@ -45,7 +45,7 @@ def rates(flavour: Flavour, positions_hz: float) -> dict[int, float]:
 
 
 def request(target: tuple[int, int], number: int) -> Message:
-    """Request for one message of a type; `target` are the numbers of system and component."""
+    """Request for one message of a type; `target`: numbers of system and component."""
     command, wanted = dialect.MAV_CMD_REQUEST_MESSAGE, float(number)
     return dialect.MAVLink_command_long_message(
         *target, command, 0, wanted, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0

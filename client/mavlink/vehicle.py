@@ -50,7 +50,7 @@ class MavlinkVehicle(Vehicle):
         return True
 
     def fly(self, velocity: Array) -> None:
-        """Fly with a velocity; in the plane the vehicle keeps its altitude."""
+        """Fly with a velocity [m/s]; with two axes the vehicle keeps its altitude."""
         x, y, *up = velocity.tolist()
         self._port.fly((x, y, up[0] if up else 0.0))
 

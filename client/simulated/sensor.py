@@ -87,7 +87,7 @@ class Sensor:
         return Measurement(stamp_ns, *(self._measure(states[0], which, step) for which in (0, 1)))
 
     def _measure(self, state: Array, which: int, step: int) -> list[float] | None:
-        """Position (0) or velocity (1) of a state, if one is due at a step."""
+        """Measured position (0) or velocity (1) of a state; None if none is due at the step."""
         every_ns, time_ns = self._every_ns[which], step * self._dt_ns
         # Due at the first step at or after a multiple of the interval, which may not be a multiple
         # of Δt.

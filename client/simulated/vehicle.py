@@ -1,4 +1,4 @@
-"""Simulated vehicle: a plant in its weather, which is advanced step by step, and a sensor."""
+"""Simulated vehicle: a plant in its weather, advanced step by step, and a sensor."""
 
 from collections.abc import Sequence
 from typing import Protocol

@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from skytether.shared.law.limits import Limits
 
 NUMBER_MAX, JUMP_MAX = 2**32 - 1, 10_000
-"""Largest leadership number, and largest accepted rise to a number that a server reports."""
+"""Largest leadership number, and largest increase by which a number reported by a server is
+adopted."""
 ASK_SHARE, CHANGE_SHARE = 0.35, 0.75
 """Shares of the time-out for which the leader has to be silent before the vehicle sends LEAD to
 another server, and before that server leads. The first share is small, just above the interval of

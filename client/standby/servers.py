@@ -72,7 +72,7 @@ class Servers(OneServer):
         super().__init__(parts.failsafe)
         number = getattr(parts.before, "leadership", 0)  # `Fresh` has no leadership
         timeout_ns = seconds_to_ns(parts.scenario.link.timeout_s)
-        # Without its former standby server, the vehicle tells the other server that it leads now.
+        # Without a standby server, the vehicle tells its only server that this server leads now.
         number += bool(number and count == 1)
         self.leadership = Leadership(count, number, timeout_ns)
         self.sessions: list[ServerSession] = []
@@ -249,7 +249,7 @@ class Servers(OneServer):
         return LimitsDiffer(vehicle=self._vehicle, host=host, port=port, differences=differing)
 
     def _report_limits(self) -> None:
-        """Report servers that may not lead, once for each difference of limits."""
+        """Report each server that may not lead, once for each difference of its limits."""
         for server in range(self._count):
             if self.leadership.may_lead(server):
                 self._differing.pop(server, None)
