@@ -245,8 +245,8 @@ class Failsafe:
         """Whether a plan that arrives now is flown."""
         may = (self.mode, Reason.HORIZON) in self._table
         # A postponed STALLED does not refuse plans: after a stall of the vehicle's computer a newer
-        # motion is better than the one in force. Any other postponed cause makes its server
-        # unreliable.
+        # motion is better than the one in force. With any other postponed cause, the motion in
+        # force is flown to its end.
         may = may and self.postponed in (None, Reason.STALLED)
         return may and self.armed and not self.has_leapt and self.reason not in LOCKING
 

@@ -36,9 +36,11 @@ class MavlinkConfig(Section, frozen=True):
         Literal["takeoff", "autopilot"] | tuple[Position, ...],
         Key(Owner.VEHICLE, ORIGIN),
     ] = "takeoff"
-    """Origin of the scenario: the point of arming (on a mission, below the first goal), the
-    autopilot's local origin, or a point in its local frame: north, east (and up) [m]. A client that
-    restarts in the air without a saved origin lets the vehicle hover until this key is set."""
+    """Origin of the scenario's frame. takeoff: the point of arming; on a mission, the point with
+    which the vehicle is armed below its first goal. autopilot: the autopilot's local origin.
+    Numbers: a point in that frame, north, east (and up) [m]. If the client restarts in the air
+    without a saved origin, the vehicle hovers until this key is set, and lands after
+    `mavlink.patience_s`."""
     second_commander: OfVehicle[Literal["brake", "yield"]] = "brake"
     """Reaction to a second commander, or to a vehicle that ignores its commands: brake and then
     land, or yield as if a pilot had taken over."""

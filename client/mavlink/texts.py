@@ -39,7 +39,7 @@ class LoggedTexts:
         return text
 
     def _is_known(self, text: str, now_ns: int) -> bool:
-        """Store the text; return whether it was already logged within the last SAME_TEXT_NS."""
+        """Whether the text was logged or omitted within SAME_TEXT_NS; stores a new text."""
         logged_ns = self._logged_ns.pop(text, None)
         if logged_ns is not None and now_ns - logged_ns < SAME_TEXT_NS:
             self._logged_ns[text] = logged_ns

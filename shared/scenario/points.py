@@ -1,4 +1,4 @@
-"""Desired trajectories through given points: rest at a point, or lines between points."""
+"""References through given points: rest at a point, or straight lines between points."""
 
 import numpy as np
 

@@ -236,7 +236,8 @@ def desired(scenario: Scenario, client: Rows, server: Rows | None = None) -> Arr
     """Desired position at every step of one vehicle [m]; shape (steps, axes).
 
     Only the server's record has the position of a live point and the goal of a vehicle on a
-    mission. A step without a row of the server gets the value of the previous row. NaN: unknown.
+    mission. A step without a row of the server gets the value of the previous row, or of the
+    first row if there is none before. NaN: unknown.
 
     Args:
         client: rows of the vehicle.

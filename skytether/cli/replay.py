@@ -63,7 +63,9 @@ def replay(argv: Sequence[str]) -> None:
 
 
 def theorem_html(recorded: Recorded) -> str:
-    """Assumptions of the separation theorem, as HTML; empty unless the flight is a mission."""
+    """Whether each assumption of the separation theorem held in the flight, with its margin, as
+    HTML; empty unless the flight is a mission.
+    """
     if not recorded.scenario.keeps_apart:
         return ""
     from skytether.theorem.judgement import judged

@@ -86,7 +86,7 @@ class AnsweredCall(NamedTuple):
     chunk_age_ns: int
     """Age of the newest chunk's observation [ns]; -1: no chunk yet."""
     left: int
-    """Number of rows of the answer computed by the policy."""
+    """Number of the answer's rows that the policy has computed; the others are the hold action."""
     sent: Any
     """Observation with compressed images; None if it was not sent."""
     reply: Any

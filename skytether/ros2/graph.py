@@ -23,7 +23,8 @@ QUALITY = "::,1:,:,:,,"
 depth of 1."""
 NODE, PUBLISHER, SUBSCRIBER = "NN", "MP", "MS"
 NAME_AT, PARTS = 8, 13
-"""Index of the node's name among a token's parts, and number of parts of a publisher's token."""
+"""Index of the node's name among a token's parts, and number of parts of a publisher's or a
+subscriber's token."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -122,7 +122,7 @@ def test_a_serial_port_carries_bytes_as_they_are() -> None:
 
 
 def test_a_rate_that_no_port_has_is_refused() -> None:
-    with pytest.raises(AddressError, match="no serial port runs at 57601 bit/s"):
+    with pytest.raises(AddressError, match="this system does not support 57601 bit/s"):
         shell(Echo(b""), "serial:/dev/ttyACM0:57601")
 
 

@@ -62,7 +62,7 @@ class Identifying(Endpoint):
 
     @property
     def finished(self) -> bool:
-        """Whether the flight has ended on the ground, or cannot begin."""
+        """Whether the flight has ended on the ground or cannot begin, or a pilot has taken over."""
         if self._ends is Reason.TAKEN:
             return True
         return (self._ends is not None or self.failure is not None) and self._flies.is_down

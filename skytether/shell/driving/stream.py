@@ -36,7 +36,7 @@ class ByteStream:
         if line.kind == "serial" and system.termios is None:
             raise AddressError(f"{line.host}: this system has no termios, which serial ports need")
         if line.kind == "serial" and not hasattr(system.termios, f"B{line.number}"):
-            raise AddressError(f"{line.host}: no serial port runs at {line.number} bit/s")
+            raise AddressError(f"{line.host}: this system does not support {line.number} bit/s")
         self._line, self._hear = line, hear
         self._end: int | None = None
 

@@ -84,7 +84,7 @@ class Log:
             self.say(admitted)
 
     def say(self, event: Event) -> None:
-        """Log an event in one write of whole lines, because workers may share the output."""
+        """Log an event; each write has whole lines only, because workers may share the output."""
         self._beside(event)
         for line in self._lines(event):
             if not self._writer.write(line):
