@@ -336,9 +336,8 @@ class Pilot:
         )
         if flown is None or mode in STOPPED:
             return [0.0] * terms.axes, 0.0, flown is not None
-        # The braking curve bounds the input without feedback; only u_max bounds the feedback
-        # (docs/failsafe.md). The fence's correction is not part of the speed either, as it may
-        # never end.
+        # `speed` is the speed from which braking continues. It excludes the feedback, which only
+        # u_max bounds (docs/failsafe.md), and the fence's correction, which may never end.
         speed = min(math.hypot(*without_feedback), speed_max) if feeds_back else math.hypot(*flown)
         if self._fence is not None:
             within = self._fence.limited(flown, navigation.predicted.tolist(), terms.u_max)

@@ -109,7 +109,9 @@ class Proxy(Emulator):
             self._forward(now_ns)
 
     def undelivered(self, socket: int, reason: str) -> None:
-        """See `Endpoint`; undelivered packets to clients, which may have ended, are counted."""
+        """Count an undelivered packet. The first one to the server since the server's last answer
+        is also reported; packets to clients are not, because clients may have ended.
+        """
         counts = self.downlink.counts if socket else self.uplink.counts
         counts.forwarded -= 1
         counts.undelivered += 1

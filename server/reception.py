@@ -344,7 +344,9 @@ class Reception:
             self._answer(question, call, datagram)
 
     def _hear_time(self, session: Session, message: Time, now_ns: int) -> None:
-        """Narrow a clock offset's bounds by the times of day of the vehicle and of this host."""
+        """Narrow the bounds on the offset of the vehicle's clock by comparing the times of day of
+        the vehicle and of this host.
+        """
         error_ns = self.time and self.time.error_at(now_ns)
         if error_ns is None or self.time is None:
             return

@@ -1,8 +1,8 @@
 """Position receiver of an autopilot, from GPS_RAW_INT: whether it has a fix, and its velocity.
 
 After the last fix an autopilot flies on by its accelerometers for seconds before its flags report
-the loss of the fix. If the receiver had no fix since the client's start, the vehicle has another
-position source.
+the loss of the fix. If there has been no usable fix since the client's start, the vehicle is
+assumed to have another position source, and no loss is reported.
 """
 
 import math

@@ -241,9 +241,11 @@ def _least_distance_within(
 ) -> float:
     """Lower bound of the distance of two motions in a time interval [m].
 
-    The shift of the other motion is divided into slices no longer than a piece. In a slice the
-    difference of the two motions is p + t a + s b + t s c for t and s from -1/2 to 1/2, with c
-    small: a parallelogram, with an error of at most |c| / 4.
+    The shift, by which the other motion is ahead, is divided into slices of at most SPACING /
+    SAMPLES steps. Between the corners of a slice the difference of the two motions is interpolated
+    as p + t a + s b + t s c, where t is the time and s the shift, both scaled to -1/2 to 1/2.
+    Without the small term c this is a parallelogram; c moves a point by at most |c| / 4. The
+    curvature of the motions between the corners is subtracted at the end (`Extent.bend`).
     """
     swept = span.most - span.least
     slices = max(int(np.ceil(swept * SAMPLES / SPACING)), 1)

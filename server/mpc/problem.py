@@ -147,9 +147,11 @@ class SimdBatch(NamedTuple):
     active: F1
     """Number of inputs in the active set; shape (L,)."""
     worst: F1
-    """Largest bound violation by an input that must enter or leave the active set; shape (L,)."""
+    """Largest distance of a free input beyond its bound or, for an input held at its bound, of its
+    unconstrained value from this bound towards the inside [m/s]; 0 if the active set is right;
+    shape (L,)."""
     worst_at: F1
-    """Stage of the input with the violation `worst`, or -1 if there is none; shape (L,)."""
+    """Stage of the input with the distance `worst`; -1 if the active set is right; shape (L,)."""
     target_p: F2
     """Desired positions at the stages 0 … H [m]; shape (H + 1, L)."""
     target_v: F2

@@ -19,9 +19,11 @@ by at most DRIFT of the elapsed time:
 over all samples of any age.
 
 The bounds are narrowed by `link.asymmetry_s`, the operator's bound on the difference of the
-smallest delays of the two directions, and by the time of day if both ends know it. Each of the two
-is checked against the bounds from delays and against its own earlier values, and is no longer used
-once it contradicts them.
+smallest delays of the two directions, and by the time of day if both ends know it. Each new value
+is checked against the bounds from delays and against all earlier values of the two. After a
+contradiction `link.asymmetry_s` is no longer used. If the time of day contradicts the bounds even
+without `link.asymmetry_s`, the bounds become wider: from then on they include both the bounds from
+delays and the bounds from the time of day.
 """
 
 from enum import IntEnum
@@ -43,7 +45,7 @@ RECENT = 3
 """Number of newest intervals that count as recent when looking for a step of a clock. If they hold
 fewer than STEP_SAMPLES samples, since the vehicle reports rarely, up to OLD intervals count."""
 OLD = 8
-"""Smallest age of the minima of F and G that recent minima are compared with [intervals]."""
+"""A recent minimum of F or G is compared only with minima at least this old [intervals]."""
 STEP_SAMPLES = 5
 """Number of samples needed in both recent and old minima to detect a step of a clock."""
 STEP_NS = 40 * MILLISECOND_NS

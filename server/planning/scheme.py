@@ -341,7 +341,9 @@ Given = Callable[[int], Reference] | None
 
 
 def given_references(scenario: Scenario, given: Given, most: int) -> Given:
-    """Desired trajectories of vehicles that are not on a mission."""
+    """Desired trajectories of vehicles that are not on a mission: `given`; or, if `given` is None
+    and the shape is a target, each vehicle's target as measured, cached for `most` vehicles.
+    """
     if given is None and scenario.reference.shape == "target":
         return lru_cache(most)(scenario.measured_reference)
     return given

@@ -73,8 +73,8 @@ def add_sample(bound: DelayBound, row: int, delay: int) -> None:
     newest = bound.seen[row] % SAMPLES
     bound.samples[row, newest] = delay
     bound.seen[row] += 1
-    # d rises at once: if d is too small, the vehicle flies other inputs before each horizon than
-    # the plan of the horizon assumes.
+    # d rises at once: while d is too small, horizons come into force late, and until then the
+    # vehicle flies other inputs than the server assumed when it computed the horizon.
     d = max(bound.steps[row], min(delay, bound.most))
     count = min(bound.seen[row], SAMPLES)
     needed, since = 0, count  # number of samples of d or more, and of samples after the last such

@@ -162,7 +162,8 @@ class Endpoint(ABC):
         assert not keys  # there are no changeable keys by default
 
     def learn_time(self, utc_ns: int, error_ns: int, *, now_ns: int) -> None:  # noqa: B027
-        """Learn the time of day, if the host knows it and its error; ignored by default.
+        """Accept the host's time of day; called only while the host knows the time and a bound of
+        the time's error. The base class ignores the time.
 
         Args:
             utc_ns: time since 1970 [ns].

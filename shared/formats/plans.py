@@ -33,7 +33,7 @@ ITEMS_MAX = 10_000
 LONG_S = 1e6
 """Longest duration of an item [s]."""
 FRAMES = {0: "above the sea", 3: "above home"}
-"""MAV_FRAME of altitudes that can be flown."""
+"""Supported MAV_FRAME values, and what an item's altitude is measured from."""
 MODE_FRAMES = {1: 3, 2: 0, 3: 0, 4: 10}
 """MAV_FRAME that QGroundControl gives an item, by its AltitudeMode: above home, above the sea,
 above the terrain (sent as above the sea), and above the autopilot's own terrain data."""

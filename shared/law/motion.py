@@ -105,7 +105,9 @@ class Clearances(NamedTuple):
 
 
 def bend_m(acceleration_mps2: float, dt_s: float) -> float:
-    """Largest distance of a motion from its straight pieces [m], given its largest acceleration."""
+    """Largest distance between a motion and the straight pieces that approximate it [m], given the
+    motion's largest acceleration; see SAMPLES.
+    """
     return acceleration_mps2 * (SPACING / SAMPLES * dt_s) ** 2 / 8.0
 
 

@@ -1,7 +1,8 @@
 """Catalogue of a scenario's keys: owner, term, and whether the key may change in flight.
 
-A key that both ends use for predictions is a term, and must be equal at both. Any other key belongs
-to one end, or to each end separately. A key without an owner in its type fails at import.
+A key with which both ends predict is a term, and must be equal at both. Each other key has one
+owner (server, vehicle, netem or virtual time), or each end reads the key from its own scenario.
+Importing this module fails if the type of a key does not name exactly one owner.
 """
 
 from collections.abc import Iterator, Mapping

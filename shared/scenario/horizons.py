@@ -22,7 +22,7 @@ def ahead_s(scenario: Scenario) -> float:
 
 
 def too_late(scenario: Scenario) -> Iterator[Contradiction]:
-    """Contradictions of a scenario with horizons too short for the network's delays or losses."""
+    """Contradictions between the network's delays or losses and horizon, delay bound or step."""
     yield from _too_slow(scenario)
     if scenario.control.properties.flown_as in INDEXED and scenario.vehicle.exhausted == "brake":
         yield from _too_short(scenario)

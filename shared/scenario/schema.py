@@ -341,8 +341,9 @@ class LinkConfig(Section, frozen=True):
     """Upper bound of the difference between the smallest delay of the uplink and that of the
     downlink, each over 20 s [s]; 0: unknown. The value bounds the error of the vehicle's clock."""
     time_of_day: OfEach[Literal["none", "host"]] = "none"
-    """Source of the time of day on a mission; if both ends have a source, the two clocks are
-    compared. host: the host's clock, with an error bound from its kernel (chrony)."""
+    """Source of the time of day on a mission. If both ends have a source, the times of day bound
+    the error of the vehicle's clock independently of delays. host: the host's clock, with the error
+    that its kernel reports (set by chrony or ntpd)."""
     timeout_s: OfEach[Interval] = 1.5
     """Silence after which the vehicle brakes and asks for a new session [s]. The server frees the
     vehicle's number after the same time, or twice this time with heartbeats "auto"."""

@@ -83,7 +83,8 @@ dead, until the probability is at most DOUBT."""
 PATIENCE = 3
 """Largest factor on the interval between probes of a path that stays down."""
 ALIKE = 1.25
-"""Sets of paths with a cost up to this multiple of the least expected cost are used in turn."""
+"""Among the sets of paths whose expected cost is at most this multiple of the least cost, those
+with the fewest paths are used in turn."""
 ALIVE_WORTH = 40.0
 """Cost if the other end considers a working link lost, in packets of price 1."""
 _SETS = {

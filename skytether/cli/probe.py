@@ -86,20 +86,20 @@ class ProbeOptions:
     bytes: int = 400
     """UDP payload of each packet [B]."""
     keys: Path | None = None
-    """File made by `skytether keygen`, with which packets are encrypted: it has the vehicle's key,
-    or for --listen the keys of all vehicles. Without keys, packets are plaintext, which is refused
-    beyond this machine.
+    """Key file made by `skytether keygen`: the vehicle's key, or with --listen the keys of all
+    vehicles. Without it, packets are not encrypted, and the command refuses addresses outside this
+    machine unless --insecure is given.
     """
     number: Annotated[int, Argument(name="id")] = 1
     """Number of the vehicle whose key is used; each further --path uses the next vehicle's key."""
     insecure: bool = False
-    """Allow plaintext beyond this machine: anybody on the path can alter the measurement."""
+    """Allow unencrypted packets to other machines: anybody on the path can alter the results."""
     out: Path = Path("probed")
     """Folder for the traces uplink.csv and downlink.csv; for several paths also for
     uplink-path-2.csv and so on, and for paths.toml, a scenario over all measured paths.
     """
     json: Path | None = None
-    """File for all figures, as JSON."""
+    """JSON file for the results."""
     figure: Path | None = None
     """File for a picture of the delays (.png, .svg or .pdf)."""
     record: Path | None = None

@@ -91,7 +91,9 @@ class Child:
         return code
 
     def last_words(self) -> str:
-        """Reason why the process ended: a signal, or the last line of its output."""
+        """Reason why the process has ended or cannot be used: the signal that ended it, or else the
+        last line of its output. Without output: its exit code, or that it does not listen in time.
+        """
         code = self.process.returncode
         if code is not None and code < 0:  # a signal ended it, so its last line is not the reason
             return f"{self.name}: ended by a signal: {signal.strsignal(-code)}"

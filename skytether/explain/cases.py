@@ -50,7 +50,9 @@ class Bad(Stretch):
 
 @dataclass(frozen=True, slots=True)
 class UsualDelay:
-    """Usual delay of packets in a direction; every packet is delayed at least that long."""
+    """Ordinary delay of one direction, as a unit. Without this unit, every packet in the explained
+    period arrives at once, except in the stretches of other units.
+    """
 
     direction: int
 
@@ -109,7 +111,7 @@ class Double:
     states: Array
     """Position [m] and velocity [m/s] at the start of each step; shape (steps, axes, 2)."""
     inputs: Array
-    """Desired velocity that is flown from each step on [m/s]; shape (steps, axes)."""
+    """Input flown in each step [m/s]; shape (steps, axes)."""
 
 
 @dataclass(frozen=True, slots=True)

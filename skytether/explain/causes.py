@@ -208,7 +208,7 @@ def _group(unit: Unit) -> str:
 WHAT = {
     (False, False): "outage",
     (False, True): "lost packet",
-    (True, False): "time of late packets",
+    (True, False): "period of late packets",
     (True, True): "late packet",
 }
 """Nouns for bad stretches, by `is_late` and `is_packet`."""

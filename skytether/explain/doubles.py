@@ -78,7 +78,8 @@ def double(recorded: "Recorded") -> tuple[FlightCase, Track]:
     scenario, dt_ns, rows = recorded.scenario, recorded.scenario.dt_ns, recorded.parts["client"]
     client, server = ends = _ends(recorded)
     began_ns = _began_ns(recorded, client)
-    # The flight's time 0 is up to a step before the recording's, so that ticks are due as recorded.
+    # Time 0 of the double is up to one step before the recording's first frame, so that the
+    # server's ticks are due when they were recorded.
     tick_ns = int(_of(server, Happened.WOKEN)["due_ns"][-1])
     zero_ns = recorded.begin_ns - (recorded.begin_ns - tick_ns - MIDNIGHT_NS) % dt_ns
     compute_ns = _compute_ns(server)

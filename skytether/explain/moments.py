@@ -58,7 +58,7 @@ class Moment:
     vehicle: int
     """Number of the vehicle, from 1; 0 for all vehicles together."""
     start_s: float
-    """Time of flight at the moment's beginning, counted as in events [s]."""
+    """Time of flight at which the moment begins [s], on the same clock as `FlightEvent.time_ns`."""
     end_s: float
     says: str
     """Description of the moment: a sentence without subject."""

@@ -75,7 +75,9 @@ def remedies(
 
 
 def with_others(each: Remedy, case: FlightCase, seeds: Sequence[int], fly_all: FlyAll) -> Remedy:
-    """Add the means over flights of other seeds to a remedy."""
+    """Remedy with its mean number of brakes, mean largest error and mean packet rate over flights
+    of the seeds `seeds`, in `elsewhere`.
+    """
     scenario, case = case.scenario, _with(case, each.name, each.keys)
     cases = [replace(case, scenario=msgspec.structs.replace(scenario, seed=seed)) for seed in seeds]
     outcomes = fly_all(cases)

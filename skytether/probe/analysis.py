@@ -106,12 +106,12 @@ def delays(measured: MeasuredPath) -> tuple[Clocks, Delays, Delays]:
     """Relation of the two clocks, and delays of the downlink and of the uplink.
 
     Raises:
-        ValueError: fewer than two packets arrived in a direction.
+        ValueError: fewer than two packets sent alone arrived in a direction.
     """
     down, up = measured.downlink, measured.uplink
     alone = down.came & (down.train < 0), up.came & (up.train < 0)
     if min(each.sum() for each in alone) < 2:
-        raise ValueError("fewer than two packets arrived in a direction")
+        raise ValueError("fewer than two packets sent alone arrived in a direction")
     near_ns, far_ns = int(down.sent_ns[0]), int(down.came_ns[down.came].min())
     x_down, y_down = _points(down.sent_ns - near_ns, down.came_ns - far_ns)
     y_up = (up.came_ns - near_ns - (up.sent_ns - far_ns)) / SECOND_NS

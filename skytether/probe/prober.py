@@ -125,7 +125,8 @@ class Prober(Endpoint):
         self._slot = 0
         """Number of the grid point at which the next probe is sent."""
         self._over_ns: int | None = None
-        """Time at which the last probe was sent [ns]; None until the last probe is sent."""
+        """Time at which the grid ended, usually that of the last probe [ns]; None while probes are
+        still to be sent."""
         self._longest_ns = 0
         self.refused = False
         """Whether the listener has refused a session, because it has too many open measurements."""

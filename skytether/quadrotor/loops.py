@@ -7,8 +7,9 @@
     rotors        rotor forces with that thrust and those torques, from 0 to the largest that the
                   battery's voltage allows
 
-The limits follow ArduPilot's input shaping: a* tracks p (target - v*), or its square root for large
-differences, with p = jerk / acceleration.
+The limits follow ArduPilot's input shaping, with Δ = |target - v*| and p = jerk / acceleration: the
+size of a* follows p Δ for Δ up to jerk / p², and √(2 jerk (Δ - jerk / (2 p²))) above, both at most
+the acceleration limit. The jerk of a* is limited, too. K, P, I and D are gains.
 """
 
 from typing import NamedTuple

@@ -232,7 +232,7 @@ def _tube(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
 
 
 def _steps_in_time(scenario: Scenario, record: Record) -> Hypothesis:
-    """Check the largest delay of a step, from the vehicle's figures and events."""
+    """Check that no step began more than STALL_NS late, by the client's figures and log events."""
     name, most_s = "each step begins in time", STALL_NS / SECOND_NS
     figures = record.figures.get("client", {}).get("by_vehicle", {})
     late_s = {
@@ -265,7 +265,9 @@ def _acceptance(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
 
 
 def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that motions are flown to their end; the margin is the time in force beyond the end."""
+    """Check that motions are flown to their end. The margin is the time for which a motion stayed
+    in force after its end [s].
+    """
     margins = {}
     for each in vehicles:
         left = each.changed[each.in_force[each.changed] < 0]
@@ -281,7 +283,9 @@ def _flown_to_the_end(scenario: Scenario, vehicles: Sequence[Flown]) -> Hypothes
 
 
 def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown]) -> Hypothesis:
-    """Check that all vehicles were observed before one moved; margin: the time between [s]."""
+    """Check that the server had observed all vehicles before it sent the first motion that moves.
+    The margin is the time from the first observation of the last vehicle to that sending [s].
+    """
     name, mission = "the server observes all first", scenario.make_reference()
     assert isinstance(mission, Mission)
     server = record.server
@@ -313,8 +317,8 @@ def _all_vehicles(scenario: Scenario, record: Record, vehicles: Sequence[Flown])
 
 
 def _clocks(record: Record) -> Hypothesis:
-    """Check that no clock sample contradicted the clock's bounds, from the server's counters,
-    because rows contain no clocks.
+    """Check that no clock sample contradicted the clock's bounds, by the server's counters and log
+    events `ClockContradicted`; rows contain no clocks.
     """
     name = "no clock contradicts its bounds"
     if "server" not in record.figures:

@@ -28,7 +28,7 @@ class Judgement:
 
     @property
     def rows(self) -> list[Sequence[str]]:
-        """Table of the hypotheses, as text; see HEADING."""
+        """Rows of the table of hypotheses, as text; HEADING has the column names."""
         return [_row(each) for each in self.hypotheses]
 
     def __str__(self) -> str:

@@ -27,7 +27,7 @@ class MarginsOptions:
     runs: Annotated[int, Argument(metavar="N")] = 16
     """Number of flights of each vehicle; seeds count up from the scenario's."""
     json: Path | None = None
-    """File for the figures, as JSON."""
+    """JSON file for the results."""
     pool: PoolFlags = Flags()
     config: ScenarioFlags = Scenario()
 

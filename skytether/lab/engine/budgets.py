@@ -156,7 +156,8 @@ class Plan:
         for contender in scale.who(case):
             self.points += flying(contender, case, tuned(contender, case, weights))
         self.runs = -(-scale.runs // 2) if case.weights else scale.runs
-        """Number of flights of each chosen point; half as many with the weights of another case."""
+        """Number of flights of each chosen contender, threshold and reporting policy; half of the
+        usual number, rounded up, if the case uses the weights of another case."""
         self._scenario = scale.scenario(case)
         self._scouting = scale.scouts, replace(self._scenario, seed=SEARCH_SEED)
         self._scouted: list[Scouted] = []

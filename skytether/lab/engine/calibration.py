@@ -160,8 +160,8 @@ class Rmse:
         return {"objective": "rmse", **asdict(self.limits)}
 
     def free(self) -> Sequence[Free]:
-        """Weights, and keys of scheme and trigger; a key with the value 0, which means off, is left
-        out.
+        """Keys that the search varies: weights, and keys of the scheme, the trigger and the
+        observer. A key with the value 0, which means off, is left out.
         """
         control, table = self.scenario.control, plain(self.scenario)
         observer = OBSERVER_KEYS if control.properties.observes else ()

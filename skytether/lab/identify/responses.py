@@ -1,4 +1,6 @@
-"""Responses to each step: timestamped velocities, with all inputs that affect them."""
+"""Response to each velocity step: time-stamped velocities around the step, and the changes of the
+input from two step durations before the step until its end.
+"""
 
 from collections.abc import Sequence
 

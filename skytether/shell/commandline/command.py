@@ -196,10 +196,12 @@ def check_sockets(flag: str, given: int) -> None:
 
 
 def claim_output(flag: str, path: Path | None) -> None:
-    """Lock an output file until the command ends, before anything is flown.
+    """Lock an output file until the command ends. Called before any flight, so that an unusable
+    file is reported at once.
 
     Raises:
-        CommandError: the file cannot be written, is an input, or is locked by another command.
+        CommandError: the file cannot be written, is an input, is named by another option, or is
+            locked by another command.
     """
     _claim(files.claim, flag, path)
 

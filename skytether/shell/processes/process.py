@@ -173,8 +173,8 @@ class Process:
             insecure: whether to run without keys at an address that other machines can reach.
             ready: called after all checks, before the first datagram is received.
             on_signal: called with the number of a signal that is to be passed on to another
-                program. This program uses stdout: events go to stderr, the final counters to feed
-                and file only.
+                program, which uses the stdout of this process. If it is given, events are printed
+                on stderr, and the final counters go only to the feed and the `--json` file.
         """
         options, feed, journal = self.options, self.feed, self.journal
         endpoint = self._watched(endpoint, None if line is None else 1)  # socket 1 is the line

@@ -45,7 +45,8 @@ class PageFlight:
         self._opened_ns: dict[str, int] = {}
         """Start time of each process on its clock [ns]; a new start time means a new process."""
         self._before: dict[str, dict[str, Any]] = {}
-        """Values of each netem from before its link was cut; `heal` restores them."""
+        """Values that the keys changed by a cut had before the cut, by netem and key; `heal`
+        restores these values."""
         self.operator = Operator(folder, self._answered) if folder else None
 
     def take(self, process: str, frame: Frame) -> None:

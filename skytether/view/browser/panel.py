@@ -248,7 +248,7 @@ class _Note:
         self._own = ""
 
     def asks(self, keys: Iterable[str]) -> None:
-        """Show refusals of these keys from now on."""
+        """From now on show the flights' refusals of a request to change exactly these keys."""
         self._keys, self._own = frozenset(keys), ""
 
     def refuse(self, why: str) -> None:

@@ -26,7 +26,8 @@ SPARE = 6
 HEIGHT, BANDS_HEIGHT, AXIS = 115, 75, 35
 """Heights of a plot and of a plot of bands, without horizontal axis, and of this axis [pixels]."""
 BAND_MODE, BAND_LINK, BAND_ENDS = 2.0, 1.0, (0.0, 3.0)
-"""Vertical positions of the bands for mode and link in the plot `STATE`, and its range."""
+"""Vertical positions of the bands for mode and link in the plot `STATE`, and the range of its
+vertical axis."""
 GREY = "#868e96"
 UP, DOWN = "#12b886", "#e64980"
 """Colours of the two directions, in plots of one flight or of data that all flights share."""
@@ -151,7 +152,7 @@ def _deadline_ms(look: Look) -> Array:
 
 
 def _compared(look: Look) -> Array:
-    """Figure that the trigger compares, cut off at SEEN times the threshold."""
+    """Trigger's figure, cut off at SEEN times the threshold unless the threshold is 0 or NaN."""
     most = np.where(look.curves.threshold > 0, SEEN * look.curves.threshold, np.inf)
     return np.where(np.isnan(most), look.curves.figure, np.minimum(look.curves.figure, most))
 

@@ -55,7 +55,7 @@ SLOTS_MAX = 1200
 stored."""
 VEHICLES_MAX = 64
 ZONED, GUIDED = "mission.zones", "mission.goals"
-"""Key of a mission's zones, and key of the goals that were changed in flight."""
+"""Key of a mission's zones, and key of the goals that replace the mission's goals in flight."""
 PLANS_MAX = 8
 """Number of stored plans of a vehicle, including retransmissions."""
 SAID_MAX = 50
