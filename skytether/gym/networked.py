@@ -211,7 +211,7 @@ class _Far:
         return Chunk(rows, first, thought_ns)
 
     def thought_ns(self, *, is_nothing: bool) -> int:
-        """Thinking time of an answer [ns], measured or drawn; 0 if it is drawn for no answer."""
+        """Thinking time of an answer [ns], measured or drawn; a drawn time without answer is 0."""
         if self.thinking is None:
             return self._clock_ns() - self._returned_ns
         if is_nothing:
@@ -452,7 +452,7 @@ def _path(key: str, text: str) -> Impairments:
 
 
 def _thinking(given: float | str) -> Impairments:
-    """Thinking times as delays; raises ConfigError for anything but delays, such as losses."""
+    """Impairments for drawing thinking times; raises ConfigError unless they are delays only."""
     text = given if isinstance(given, str) else f"constant({float(given)!r})"
     delays = _path("thinking", text)
     if delays.queue or any(each.kind != "delay" for _, each in delays.parts) or delays.loss:

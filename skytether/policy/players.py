@@ -34,7 +34,8 @@ class Chunk(NamedTuple):
     first: int | None = None
     """Step of the first row, as the player counts steps; None: step of the newest observation."""
     thought_ns: int | None = None
-    """Computation time of the chunk [ns], to repeat a run; None: the environment's `thinking`."""
+    """Computation time of the chunk [ns]; give it to repeat an earlier run. None: measured or drawn
+    as the environment's option `thinking` says."""
 
 
 class Held(NamedTuple):

@@ -194,7 +194,8 @@ class RobotEnd(Endpoint):
         self._on_answer = on_answer
         self._exchange: Exchange | None = None
         self._session = (0, 0)
-        """Number of the session, and number of the policy end's run."""
+        """Session number and the policy end's boot id, from the newest accepted WELCOME; (0, 0)
+        before the first."""
         self._hello_ns: int | None = 0
         """Time of the next HELLO [ns]; None during a session."""
         self._heard_ns = self._sent_ns = 0
@@ -217,9 +218,10 @@ class RobotEnd(Endpoint):
         self._late_ns = 0
         """Longest time by which an answer exceeded its deadline [ns]."""
         self._is_holding = False
-        self._age_ns, self._left = -1, 0
-        """At the last answer: age of the newest chunk's observation [ns], -1: no chunk; and number
-        of rows computed by the policy."""
+        self._age_ns = -1
+        """Age of the newest chunk's observation at the last answer [ns]; -1: no chunk."""
+        self._left = 0
+        """Number of rows of the last answer that the policy computed."""
 
     # -- datagrams -----------------------------------------------------------------------------
 

@@ -45,8 +45,8 @@ PATHS_MAX = 4
 AGAIN_NS = SECOND_NS
 """Time after which a lost connection to the policy is reopened [ns]."""
 POLICY = "policy"
-"""Peer of the local connection: `(POLICY, connection)`. Connection numbers are not reused, so that
-a reply after the end of its connection is ignored."""
+"""Name in the policy's peer address on the local socket: `(POLICY, connection number)`. The numbers
+are not reused, so a reply that arrives after its connection has ended is ignored."""
 
 
 class _Job(NamedTuple):
