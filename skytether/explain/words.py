@@ -100,11 +100,15 @@ def _counted(parts: Iterable[CausePart]) -> list[str]:
     """Nouns of parts with their number, such as "2 outages of the uplink"."""
     nouns = Counter(_noun(part.unit) for part in parts)
     return [
-        " ".join(
-            [f"{count} {what}s" if count > 1 else f"one {what}" if where else what, where]
-        ).strip()
+        " ".join([_several(count, what) if where or count > 1 else what, where]).strip()
         for (what, where), count in nouns.items()
     ]
+
+
+def _several(count: int, noun: str) -> str:
+    """Number and noun, such as "2 periods of late packets"."""
+    head, of, rest = noun.partition(" of ")
+    return f"{count} {head}s{of}{rest}" if count > 1 else f"one {noun}"
 
 
 def _noun(unit: Unit) -> tuple[str, str]:

@@ -13,9 +13,11 @@ import pytest
 import skytether
 from skytether.explain import moments, picture, units
 from skytether.explain.cases import Bad, FlightCase, Setting, Stall, UsualDelay, overridden
+from skytether.explain.causes import CausePart
 from skytether.explain.explanation import Explanation, _chosen, explain, explained
 from skytether.explain.flying import CaseOutcome, fly
 from skytether.explain.moments import Moment, comes_about
+from skytether.explain.words import _counted
 from skytether.library import flight as flight_module
 from skytether.netem.impairments.outages import Delivered
 from skytether.shared.base.errors import ConfigError
@@ -266,6 +268,18 @@ def test_late_packets_are_named_by_their_direction() -> None:
     assert cause
     innocent = {name for name, _ in cause.innocent}
     assert {"late packets of the uplink", "late packets of the downlink"} <= innocent
+
+
+def test_several_units_of_a_kind_are_in_the_plural() -> None:
+    late = [
+        CausePart(Bad((0, UPLINK, 0), first, first + 9, is_late=True), 0.0, 1.0, True, 0.1)
+        for first in (0, 20)
+    ]
+    lost = replace(late[0], unit=Bad((0, UPLINK, 0), 40, 41, is_packet=True))
+    assert _counted([*late, lost]) == [
+        "2 periods of late packets of the uplink",
+        "one lost packet of the uplink",
+    ]
 
 
 def test_of_two_moments_at_once_the_one_that_begins_then_is_meant() -> None:
