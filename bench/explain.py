@@ -56,6 +56,7 @@ class Flight(NamedTuple):
 LONG_BURSTS = "paper(0.4, 0.02, 2.0) & gilbert_elliott(0.2, 6.0)"
 FLIGHTS: Mapping[str, Flight] = {
     "demo, bursts": Flight("demo", BURSTS),
+    "demo, loss 0.6": Flight("demo", HALF_LOST),
     "target, bursts": Flight("target", BURSTS),
     "target, loss 0.6": Flight("target", HALF_LOST),
     "paper, loss 0.6": Flight("paper", HALF_LOST),
