@@ -11,6 +11,7 @@
 |---|---|
 | `robot`, `serving` | robot end and policy end, `RobotEnd` and `PolicyEnd`, without input/output |
 | `schedule`, `players` | received action chunks, and the row to execute at each control step |
+| `committed` | prediction of the rows that a robot executes until a new chunk can arrive |
 | `exchange`, `parts`, `pace` | messages as datagrams with parity, at an estimated send rate |
 | `messages` | datagram format |
 | `values`, `images` | serialization of observations and actions |

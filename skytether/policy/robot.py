@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 from skytether.client.link import ClientLink
 from skytether.policy import events, values
+from skytether.policy.committed import DELAYS, RobotRows
 from skytether.policy.exchange import Exchange
 from skytether.policy.messages import (
     CHUNK,
@@ -55,9 +56,9 @@ STEP_NS_FIRST = 50 * MILLISECOND_NS
 """Assumed length of a control step before it is measured [ns]."""
 STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
 """Bounds of the measured step length [ns]: a pause of the program is not a long step."""
-MEASURED, DELAYS, ASKED_MAX = 9, 64, 1024
-"""Number of newest intervals between calls that give the step length, of newest chunk delays that
-are evaluated, and of newest observations whose chunks are accepted."""
+MEASURED, ASKED_MAX = 9, 1024
+"""Number of newest intervals between calls that give the step length, and of newest observations
+whose chunks are accepted."""
 ROWS_SENT = 64
 """Largest number of next rows that are sent with an observation."""
 KINDS = (Kind.FRESH, Kind.REST, Kind.HOLD, Kind.ERROR)
@@ -143,8 +144,6 @@ class _Asked(NamedTuple):
     """Step of the first row of its chunk."""
     stood_ns: float
     """`Schedule.stood_ns` at the observation [ns]."""
-    connection: int
-    """Number of the program's connection."""
 
 
 @dataclass(slots=True)
@@ -152,7 +151,6 @@ class _Program:
     """Connected robot program."""
 
     peer: Address
-    number: int
     schedule: Schedule
     intervals_ns: deque[int]
     """Newest times from an answer to the next call [ns]; the first is an assumed value."""
@@ -205,8 +203,8 @@ class RobotEnd(Endpoint):
         self._program: _Program | None = None
         self._call: _Call | None = None
         self._asked: dict[int, _Asked] = {}
-        """Sent observations, by call number."""
-        self._calls = self._connections = 0
+        """Sent observations of the connected program, by call number."""
+        self._calls = 0
         self._waits = True
         """Whether the newest chunk arrived within the deadline; otherwise calls are answered at
         once while rows remain."""
@@ -330,10 +328,10 @@ class RobotEnd(Endpoint):
                 schedule = Schedule(
                     player, options.actions, options.key, step_ns, rows, late_ns, now_ns
                 )
-                self._connections += 1
                 intervals_ns = deque([STEP_NS_FIRST * options.rows], MEASURED)
-                self._program = _Program(peer, self._connections, schedule, intervals_ns)
+                self._program = _Program(peer, schedule, intervals_ns)
                 self._call = None
+                self._asked.clear()  # their chunks are for the previous program
                 self._events.append(events.ProgramConnected(robot=self._robot))
                 self._greet()
             case FrameType.CLOSED if self._program and self._program.peer == peer:
@@ -373,11 +371,14 @@ class RobotEnd(Endpoint):
             observation = values.unpack(data, most=values.MADE_BYTES_MAX)
             compressed = self._compress(observation)
             seen = values.pack(compressed)
-            coming = None
+            held = None
             if self._wants_rows:
-                coming = schedule.coming(ROWS_SENT, now_ns=now_ns)
+                # Chunks of calls that are no longer in `_asked` are not accepted.
+                acknowledged = max(program.newest, next(iter(self._asked), call.number) - 1)
+                rows = schedule.coming(ROWS_SENT, now_ns=now_ns)
+                held = RobotRows(options.key, number, acknowledged, rows)
             left, delay = schedule.left(now_ns=now_ns), self._delay_steps(schedule)
-            content = [call.number, left, delay, coming, seen]
+            content = [call.number, left, delay, held, seen]
             message = values.pack(content)
             if len(message) > values.BYTES_MAX:
                 raise ValueRefused(f"got {len(message)} B, expected at most {values.BYTES_MAX}")
@@ -387,7 +388,7 @@ class RobotEnd(Endpoint):
             self._events.append(refused)
             self._answer(Kind.ERROR, now_ns, f"the observation is refused: {error}")
             return
-        self._asked[call.number] = _Asked(now_ns, number, schedule.stood_ns, program.number)
+        self._asked[call.number] = _Asked(now_ns, number, schedule.stood_ns)
         while len(self._asked) > ASKED_MAX:
             del self._asked[next(iter(self._asked))]
         call.message, call.sent = message, compressed
@@ -419,7 +420,7 @@ class RobotEnd(Endpoint):
         except (ValueRefused, TypeError, ValueError):
             raise ProtocolError(Drop.FIELD) from None
         asked, program = self._asked.get(call_number), self._program
-        if asked is None or program is None or asked.connection != program.number:
+        if asked is None or program is None:
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         call = self._call
         if error:

@@ -8,12 +8,14 @@ sent to the robot end as an error, and the robot continues with its remaining ro
 
 from collections import Counter, OrderedDict
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from skytether.policy import events, values
+from skytether.policy.committed import RobotRows, UnderWay
 from skytether.policy.exchange import Exchange
 from skytether.policy.messages import (
     CHUNK,
@@ -26,7 +28,9 @@ from skytether.policy.messages import (
     encode,
 )
 from skytether.policy.pace import RATE_MAX
-from skytether.policy.robot import LINE, FrameType
+from skytether.policy.players import Clocked, Held
+from skytether.policy.robot import LINE, ROWS_SENT, FrameType
+from skytether.policy.schedule import rows_of
 from skytether.policy.values import ValueRefused
 from skytether.server.gate import Gate, GateCall, ReplyPath
 from skytether.shared.base.units import SECOND_NS
@@ -55,7 +59,11 @@ class _Job(NamedTuple):
     call: int
     is_urgent: bool
     """Whether the robot's rows are expected to run out before the chunk arrives."""
-    observation: bytes
+    observation: Any
+    delay: int
+    """Delay bound d [steps]."""
+    held: RobotRows | None
+    """Rows that the robot has; None if it does not send them."""
 
 
 @dataclass(slots=True)
@@ -72,6 +80,7 @@ class _Robot:
     """Observation for which the policy computes a chunk."""
     answered: tuple[int, bytes] = (-1, b"")
     """Number of the newest call with a chunk, and the message with that chunk."""
+    under_way: UnderWay = field(default_factory=UnderWay)
     asked_ns: int = 0
     """Time at which the policy got the observation, or its connection began to open [ns]."""
     is_open: bool = False
@@ -106,8 +115,8 @@ class PolicyEnd(Endpoint):
         patience_ns: longest time for a reply of the policy; then the connection is reopened [ns].
         gives_rows: whether the keys `delay_steps`, `coming` and `committed` are added to an
             observation: the longest recent time from observation to chunk in control steps, the
-            robot's remaining rows from the observation's step on, and the first `delay_steps` of
-            them, which are executed before the chunk arrives.
+            rows that the robot will execute from the observation's step on, and the first
+            `delay_steps` of them, which are executed before the chunk arrives, see `committed`.
         rate_max: largest send rate to each robot [B/s].
         unpacker: makes the hook that decompresses the images of one observation, see
             `images.Unpacker`; None: images are not compressed.
@@ -308,6 +317,10 @@ class PolicyEnd(Endpoint):
             message = values.pack([job.call, b"", error])
         if not error:  # after an error the robot may send the observation again
             robot.answered = job.call, message
+            if job.held:
+                with suppress(ValueRefused):  # the robot end refuses it too, and logs the reason
+                    rows = rows_of(values.unpack(reply), job.held.key).astype(np.float64)
+                    robot.under_way.add(job.held.step, Held(job.call, job.held.step, rows))
         robot.exchange.send(CHUNK, message, is_urgent=job.is_urgent)
 
     def _give_metadata(self, robot: _Robot) -> None:
@@ -318,8 +331,11 @@ class PolicyEnd(Endpoint):
 
     def _observe(self, robot: _Robot, message: bytes, now_ns: int) -> None:
         try:
-            call, left, delay, coming, seen = values.unpack(message)
+            call, left, delay, held, seen = values.unpack(message)
+            held = None if held is None else RobotRows(*held)
             if not all(type(each) is int for each in (call, left, delay)):
+                raise ProtocolError(Drop.FIELD)
+            if held and not _is_valid(held):
                 raise ProtocolError(Drop.FIELD)
             if any(job and job.call == call for job in (robot.thinking, robot.waiting)):
                 return  # a repeated observation
@@ -327,27 +343,41 @@ class PolicyEnd(Endpoint):
                 robot.exchange.send(CHUNK, robot.answered[1], is_urgent=True)
                 return
             observation = values.unpack(seen, self._unpacker and self._unpacker())
-            if self._gives_rows and isinstance(observation, dict):
-                observation["delay_steps"] = delay
-                if coming is not None:
-                    if not isinstance(coming, np.ndarray) or not coming.ndim:
-                        raise ProtocolError(Drop.FIELD)
-                    observation |= {"coming": coming, "committed": coming[:delay]}
-            content = values.pack(observation)
         except (ValueRefused, TypeError, ValueError):
             raise ProtocolError(Drop.FIELD) from None
         self._counts["observations"] += 1
         self._counts["replaced"] += robot.waiting is not None
-        robot.waiting = _Job(call, left <= delay, content)
+        robot.waiting = _Job(call, left <= delay, observation, delay, held)
         self._ask(robot, now_ns)
 
     def _ask(self, robot: _Robot, now_ns: int) -> None:
         """Send the newest observation to the policy, if the policy is idle."""
-        if robot.waiting and robot.is_open and robot.thinking is None:
-            robot.thinking, robot.waiting = robot.waiting, None
-            robot.asked_ns = now_ns
-            said = FrameType.MESSAGE.value + robot.thinking.observation
-            self.send(said, (POLICY, robot.connection), LINE)
+        if not (robot.waiting and robot.is_open and robot.thinking is None):
+            return
+        job, robot.waiting = robot.waiting, None
+        try:
+            content = values.pack(self._with_rows(job, robot.under_way))
+        except ValueError:  # rows of another shape than those of the policy
+            self._drops[Drop.FIELD] += 1
+            return
+        robot.thinking, robot.asked_ns = job, now_ns
+        self.send(FrameType.MESSAGE.value + content, (POLICY, robot.connection), LINE)
+
+    def _with_rows(self, job: _Job, under_way: UnderWay) -> Any:
+        """Observation with the rows that the robot will execute, if `gives_rows`."""
+        held = job.held
+        if not (self._gives_rows and held and isinstance(job.observation, dict)):
+            return job.observation
+        under_way.acknowledge(held.acknowledged)
+        player = Clocked()
+        if held.rows is not None:
+            player.accept(Held(held.acknowledged, held.step, held.rows), held.step)
+        rows, _ = under_way.predict(player, held.step, job.delay, ROWS_SENT)
+        keys: dict[str, Any] = {"delay_steps": job.delay}
+        if rows:
+            coming = np.stack(rows)
+            keys |= {"coming": coming, "committed": coming[: job.delay]}
+        return job.observation | keys
 
     # -- time ----------------------------------------------------------------------------------
 
@@ -400,3 +430,10 @@ class PolicyEnd(Endpoint):
                 str(number): robot.exchange.figures() for number, robot in self._robots.items()
             },
         }
+
+
+def _is_valid(held: RobotRows) -> bool:
+    key, step, acknowledged, rows = held
+    is_array = isinstance(rows, np.ndarray) and rows.ndim > 0
+    kinds = type(key), type(step), type(acknowledged)
+    return kinds == (str, int, int) and (rows is None or is_array)

@@ -360,7 +360,38 @@ def test_the_hold_action_is_the_last_row_that_was_executed() -> None:
     assert answer.reply["actions"][0, 0] == 5.0
 
 
-@pytest.mark.parametrize("coming", [np.array(1.0), "rows", [1, 2], 3])
+def test_committed_rows_are_executed_also_with_several_chunks_under_way() -> None:
+    """A call each step, and 6.5 steps from an observation to its chunk."""
+    rng, committed = np.random.default_rng(1), list[list[float]]()
+
+    def continued(observation: Any) -> Any:
+        rows = observation.get("committed", np.zeros((0, 1)))
+        committed.append(rows[:, 0].tolist())
+        return {"actions": np.concatenate([rows, rng.uniform(size=(12 - len(rows), 1))])}
+
+    options = RobotOptions("absolute", MS, step_ns=20 * MS, plays_on=True)
+    ways = {"to_policy": "constant(65ms)", "to_robot": "constant(65ms)"}
+    lab, executed = Lab(continued, options, gives_rows=True, **ways), list[float]()
+    lab.connect()
+    lab.infer(state(0.0))
+    committed.clear()
+    for _ in range(40):
+        began_ns = lab.now_ns
+        executed.append(first_row(lab.infer(state(0.0))))
+        lab.run(began_ns + 20 * MS)
+    assert [len(each) for each in committed[20:]] == [7] * (len(committed) - 20)
+    assert len(committed) >= 35
+    for step, rows in enumerate(committed[20:33], start=20):
+        assert rows == executed[step : step + 7]
+
+
+@pytest.mark.parametrize(
+    "coming",
+    [
+        *(np.array(1.0), "rows", [1, 2], 3, ["actions", 0, 0, np.array(1.0)]),
+        *(["actions", 0, 0, "rows"], ["actions", 0.5, 0, None], [3, 0, 0, None]),
+    ],
+)
 def test_rows_that_a_robot_cannot_have_are_refused(coming: Any) -> None:
     lab = Lab(gives_rows=True)
     lab.connect()
@@ -369,6 +400,20 @@ def test_rows_that_a_robot_cannot_have_are_refused(coming: Any) -> None:
     message = values.pack([9, 1, 1, coming, values.pack(state(3.0))])
     with pytest.raises(ProtocolError):
         lab.server._observe(robot, message, lab.now_ns)
+
+
+def test_an_observation_with_rows_of_another_shape_than_the_policys_is_dropped() -> None:
+    lab = Lab(gives_rows=True, thinking=None)
+    lab.connect()
+    robot = lab.server._robots[1]
+    for call, row in ((9, np.zeros((1, 2))), (10, np.zeros((3, 1)))):
+        message = values.pack([call, 1, 9, ["actions", 5, 0, row], values.pack(state(3.0))])
+        lab.server._observe(robot, message, lab.now_ns)
+        lab.policy_says(FrameType.MESSAGE.value + values.pack(ramp(state(0.0))), ("policy", 1))
+    lab.server._observe(
+        robot, values.pack([11, 1, 9, ["actions", 8, 0, np.zeros((9, 2))], b"\x80"]), 0
+    )
+    assert lab.server.figures()["dropped"] == {"field": 1}
 
 
 @pytest.mark.parametrize(
