@@ -10,8 +10,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from skytether.policy import parts
+from skytether.policy.form import PART_HEAD_BYTES, block_parts, form_of
 from skytether.policy.messages import STAMPS, PartMessage, Report, encode
-from skytether.policy.pace import RATE_MAX, Pace
+from skytether.policy.pace import RATE_MAX, Missed, Pace
 from skytether.policy.parts import Part, Reassembly
 from skytether.shared.base.units import HEADER_BYTES, MICROSECOND_NS, MILLISECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -21,8 +22,6 @@ QUIET_NS = 300 * MILLISECOND_NS
 time between two datagrams at the smallest send rate."""
 REMEMBERED_MAX = 64
 """Largest number of sent messages whose reports are awaited, and of reports that are not sent."""
-PART_HEAD_BYTES = 40
-"""Size of header and encryption of a datagram with a part [B]."""
 
 
 @dataclass(slots=True)
@@ -41,6 +40,7 @@ class _Coming:
 
     number: int
     expected: int
+    missed: int
     first_ns: int
     last_ns: int = 0
     sent_us: int = 0
@@ -70,6 +70,7 @@ class Exchange:
         self._numbers: dict[int, int] = {}
         self._coming: dict[int, _Coming] = {}
         self._whole: dict[int, Reassembly] = {}
+        self._missed: dict[int, Missed] = {}
         self._delay_us = 0
         """Newest one-way delay plus the unknown clock offset, without wrap-around [µs]."""
         self.sent = self.sent_bytes = self.dropped = self.came = self.repaired = 0
@@ -89,12 +90,8 @@ class Exchange:
     def _begin(self, stream: int) -> None:
         message, is_urgent = self._next.pop(stream)
         number = self._numbers[stream] = self._numbers.get(stream, -1) + 1
-        loss = self.pace.loss
-
-        def parity(count: int) -> int:
-            return max(parts.parity_for(count, loss), count if is_urgent else 0)
-
-        self._queue[stream] = deque(parts.split(message, stream, number, parity))
+        form = form_of(len(message), self.pace.loss, is_urgent=is_urgent)
+        self._queue[stream] = deque(parts.split(message, stream, number, form.parity))
         self._sent[stream, number] = _Sent()
         while len(self._sent) > REMEMBERED_MAX:
             self._sent.popitem(last=False)
@@ -160,9 +157,10 @@ class Exchange:
             if not is_spare:  # else a duplicate, or a surplus part of a complete message
                 raise
         if coming is None:
-            count, _ = parts.block_parts(part.size, part.blocks)
+            count, _ = block_parts(part.size, part.blocks)
             expected = part.blocks * (count + part.parity)
-            coming = self._coming[stream] = _Coming(part.number, expected, now_ns)
+            missed = self._missed.setdefault(stream, Missed()).begin(part.number)
+            coming = self._coming[stream] = _Coming(part.number, expected, missed, now_ns)
         if part.number == coming.number:
             self._count(coming, message, now_ns)
             if len(coming.places) == coming.expected:
@@ -189,6 +187,7 @@ class Exchange:
             stream,
             coming.number,
             len(coming.places),
+            min(coming.missed, 255),
             min(coming.bytes, 2**32 - 1),
             (last_us - coming.sent_us) % STAMPS,
             min((coming.last_ns - coming.first_ns) // MICROSECOND_NS, STAMPS - 1),
@@ -207,7 +206,7 @@ class Exchange:
         change_us = (seen.delay_us - self._delay_us + STAMPS // 2) % STAMPS - STAMPS // 2
         self._delay_us += change_us
         self.pace.heard(
-            sent.parts,
+            sent.parts * (1 + seen.missed),
             seen.came,
             seen.bytes,
             self._delay_us * MICROSECOND_NS,

@@ -3,7 +3,8 @@
     HELLO    [1, 1, robot, boot_id, name]                         to the policy end, until answered
     WELCOME  [1, 2, robot, session, boot_id, server_boot_id, refusal]
     PART     [1, 20, session, stream, number, size, blocks, parity, block, place, sent_us, data]
-    REPORT   [1, 21, session, stream, number, came, bytes, delay_us, spread_us, sent_us, held_us]
+    REPORT   [1, 21, session, stream, number, came, missed, bytes, delay_us, spread_us, sent_us,
+              held_us]
 
 The first two fields, version and type, are those of `shared.wire.protocol`, so that the same
 channels encrypt the datagrams. Times are in microseconds modulo 2^32.
@@ -14,7 +15,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
-from skytether.policy.parts import PARITY_MAX, PART_BYTES_MAX, Part
+from skytether.policy.form import PARITY_MAX, PART_BYTES_MAX
+from skytether.policy.parts import Part
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, VERSION, Refusal, kind_of
 
@@ -80,6 +82,8 @@ class Report(NamedTuple):
     came: U16
     """Number of received parts; 0 marks a keep-alive, whose `number` is 1 if the robot end has the
     metadata."""
+    missed: U8
+    """Number of messages of which no part has arrived, found since the last report."""
     bytes: U32
     """Bytes of the received parts, headers included [B]."""
     delay_us: U32

@@ -31,6 +31,36 @@ LOSS_FIRST, LOSS_MAX = 0.02, 0.4
 """Packet loss ratio assumed before the first report, and largest estimate."""
 GAIN_UP, GAIN_DOWN = 0.3, 0.05
 """Filter gains for a reported loss above and below the estimate."""
+MISSED_AFTER = 3
+"""A message of which no part has arrived counts as lost when one arrives whose number is greater by
+more than this: messages may overtake each other."""
+
+
+class Missed:
+    """Messages of a stream of which no part has arrived, at its receiver."""
+
+    def __init__(self) -> None:
+        self._checked: int | None = None
+        """Number of the first message that has not been checked; None before the first message."""
+        self._begun = set[int]()
+        """Later messages of which a part has arrived."""
+
+    def begin(self, number: int) -> int:
+        """Add a message of which the first part arrives; returns how many are newly missed."""
+        self._begun.add(number)
+        checked = number if self._checked is None else self._checked
+        until = max(checked, number - MISSED_AFTER)
+        begun = {each for each in self._begun if each < until}
+        missed = until - checked - len(begun)
+        self._begun -= begun
+        self._checked = until
+        return max(missed, 0)
+
+
+def filtered(loss: float, sent: int, came: int) -> float:
+    """Packet loss ratio, from its last value and the number of parts sent and received since."""
+    share = max(0.0, 1.0 - came / sent)
+    return min(loss + (GAIN_UP if share > loss else GAIN_DOWN) * (share - loss), LOSS_MAX)
 
 
 class Pace:
@@ -78,7 +108,7 @@ class Pace:
         """Update the send rate and the loss from a report on a message.
 
         Args:
-            sent, came: number of parts sent, and of parts received.
+            sent, came: number of parts sent, also of missed messages, and of parts received.
             size: bytes of the received parts [B].
             delay_ns: one-way delay of the last part, plus an unknown constant clock offset [ns].
             round_trip_ns: round-trip time of the last part, an upper bound of the queueing delay
@@ -87,9 +117,7 @@ class Pace:
             was_limited: whether the send rate delayed the message.
         """
         self.round_trip_ns = round_trip_ns
-        share = max(0.0, 1.0 - came / sent)
-        self.loss += (GAIN_UP if share > self.loss else GAIN_DOWN) * (share - self.loss)
-        self.loss = min(self.loss, LOSS_MAX)
+        self.loss = filtered(self.loss, sent, came)
         if self._least and delay_ns - self._least[0][1] > round_trip_ns:
             self._least.clear()  # longer than the round-trip time: a clock was stepped
         while self._least and self._least[-1][1] >= delay_ns:

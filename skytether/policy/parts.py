@@ -1,37 +1,24 @@
 """Split messages into datagrams with parity, and reassemble them.
 
-A message is split into blocks of k <= BLOCK_PARTS data parts of equal length, and m parity parts
-are added to each block (Reed-Solomon code of zfec): any k of the k + m parts restore the block.
-Parts of the blocks are sent interleaved, so that a burst of losses is spread over the blocks. With
-18 data parts and a packet loss ratio of 5 %, 40 % of the messages arrive complete without parity,
-and 99.6 % with 4 parity parts.
+The number of parts is that of `form`, the code is Reed-Solomon's (zfec). Parts of the blocks are
+sent interleaved, so that a burst of losses is spread over the blocks.
 
 Parts are not retransmitted. The receiver keeps the newest HELD_MAX incomplete messages. When a
 message is complete, the receiver discards older messages, because the newer one replaces them.
 """
 
-from collections.abc import Callable
-from math import comb
 from typing import NamedTuple
 
 import zfec
 
+from skytether.policy.form import PARITY_MAX, block_parts, blocks_of
 from skytether.policy.values import BYTES_MAX
 from skytether.shared.wire.drop import Drop, ProtocolError
 
-PART_BYTES_MAX = 1120
-"""Largest part [B]; with headers and encryption the datagram stays below 1200 B."""
-BLOCK_PARTS = 192
-"""Largest number of data parts of a block."""
-PARITY_MAX = 64
-"""Largest number of parity parts of a block; the code has at most 256 parts."""
 HELD_MAX = 4
 """Largest number of incomplete messages that a receiver keeps of a stream."""
-WHOLE_MIN = 0.995
-"""Required share of complete messages at the measured loss."""
 
-
-Form = tuple[int, int, int]
+_Shape = tuple[int, int, int]
 """Size of a message [B], number of blocks, and number of parity parts of each block."""
 
 
@@ -53,36 +40,20 @@ class Part(NamedTuple):
     data: bytes
 
 
-def block_parts(size: int, blocks: int) -> tuple[int, int]:
-    """Number k of data parts of a block, and the length of each part [B]."""
-    count = max(1, -(-size // (blocks * PART_BYTES_MAX)))
-    return count, max(1, -(-size // (blocks * count)))
-
-
-def blocks_of(size: int) -> int:
-    """Number of blocks of a message of this size [B]."""
-    return max(1, -(-size // (PART_BYTES_MAX * BLOCK_PARTS)))
-
-
-def split(message: bytes, stream: int, number: int, parity: Callable[[int], int]) -> list[Part]:
-    """Parts of a message, in the order in which they are sent.
-
-    Args:
-        parity: function from the number of data parts of a block to its number of parity parts.
-    """
+def split(message: bytes, stream: int, number: int, parity: int) -> list[Part]:
+    """Parts of a message, with `parity` parity parts of each block, in the order of sending."""
     size, blocks = len(message), blocks_of(len(message))
     count, length = block_parts(size, blocks)
-    extra = min(parity(count), PARITY_MAX)
     padded = message.ljust(blocks * count * length, b"\0")
     coded = []
     for block in range(blocks):
         begins = range(block * count * length, (block + 1) * count * length, length)
         data = [padded[at : at + length] for at in begins]
-        more = zfec.Encoder(count, count + extra).encode(data)[count:] if extra else []
+        more = zfec.Encoder(count, count + parity).encode(data)[count:] if parity else []
         coded.append([*data, *more])
     return [
-        Part(stream, number, size, blocks, extra, block, index, coded[block][index])
-        for index in range(count + extra)
+        Part(stream, number, size, blocks, parity, block, index, coded[block][index])
+        for index in range(count + parity)
         for block in range(blocks)
     ]
 
@@ -99,7 +70,7 @@ class Reassembly:
     """Reassembly of the messages of one stream."""
 
     def __init__(self) -> None:
-        self._partial: dict[int, tuple[Form, list[dict[int, bytes]]]] = {}
+        self._partial: dict[int, tuple[_Shape, list[dict[int, bytes]]]] = {}
         """Incomplete messages by sequence number: the parts of each block by index."""
         self.newest = -1
         """Sequence number of the newest complete message; -1: none."""
@@ -117,7 +88,7 @@ class Reassembly:
         if part.number <= self.newest:
             raise ProtocolError(Drop.OVERTAKEN)
         held = self._partial.get(part.number)
-        form = part.size, part.blocks, part.parity
+        shape = part.size, part.blocks, part.parity
         if held is None:
             if len(self._partial) == HELD_MAX:
                 oldest = min(self._partial)
@@ -125,8 +96,8 @@ class Reassembly:
                     raise ProtocolError(Drop.OVERTAKEN)
                 del self._partial[oldest]
                 self.given_up += 1
-            held = self._partial[part.number] = form, [{} for _ in range(part.blocks)]
-        if held[0] != form:
+            held = self._partial[part.number] = shape, [{} for _ in range(part.blocks)]
+        if held[0] != shape:
             raise ProtocolError(Drop.FIELD)
         blocks = held[1]
         block = blocks[part.block]
@@ -164,21 +135,3 @@ def _check(part: Part) -> None:
         raise ProtocolError(Drop.FIELD)
     if part.place >= count + part.parity or len(part.data) != length:
         raise ProtocolError(Drop.FIELD)
-
-
-def parity_for(count: int, loss: float) -> int:
-    """Number of parity parts with which a block is restored with probability WHOLE_MIN.
-
-    Args:
-        count: number of data parts.
-        loss: packet loss ratio; losses are assumed independent.
-    """
-    for extra in range(PARITY_MAX):
-        sent = count + extra
-        whole = sum(
-            comb(sent, lost) * loss**lost * (1.0 - loss) ** (sent - lost)
-            for lost in range(extra + 1)
-        )
-        if whole >= WHOLE_MIN:
-            return extra
-    return PARITY_MAX

@@ -6,9 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from skytether.policy import parts
+from skytether.policy import form, parts
 from skytether.policy.exchange import Exchange
 from skytether.policy.messages import OBSERVATION, PartMessage, Report, decode, encode
+from skytether.policy.pace import Missed
 from skytether.policy.parts import HELD_MAX, Part, Reassembly
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -19,7 +20,7 @@ SIZES = st.integers(1, 6000) | st.sampled_from([1120, 1121, 215_040, 215_041, 50
 
 
 def cut(message: bytes, number: int = 0, parity: int = 3) -> list[Part]:
-    return parts.split(message, OBSERVATION, number, lambda _: parity)
+    return parts.split(message, OBSERVATION, number, parity)
 
 
 def put(whole: Reassembly, each: Part) -> bytes | None:
@@ -47,7 +48,7 @@ def test_any_k_parts_of_each_block_are_enough(size: int, parity: int, random: Ra
 def test_with_one_part_less_nothing_arrives() -> None:
     whole = Reassembly()
     made = cut(bytes(5000))
-    count, _ = parts.block_parts(5000, 1)
+    count, _ = form.block_parts(5000, 1)
     assert [put(whole, each) for each in made[: count - 1]] == [None] * (count - 1)
 
 
@@ -101,7 +102,7 @@ def test_parts_that_disagree_are_refused() -> None:
 
 def test_parity_follows_the_loss() -> None:
     """Values for a Reed-Solomon code with 18 data parts, from the binomial distribution."""
-    assert [parts.parity_for(18, loss) for loss in (0.0, 0.01, 0.05, 0.1)] == [0, 2, 4, 7]
+    assert [form.parity_for(18, loss) for loss in (0.0, 0.01, 0.05, 0.1)] == [0, 2, 4, 7]
 
 
 @given(st.binary(max_size=80))
@@ -160,6 +161,33 @@ def test_the_sender_learns_round_trip_and_loss() -> None:
     assert ends[0].pace.loss == pytest.approx(0.2, abs=0.1)
     assert ends[0].pace.round_trip_ns == pytest.approx(40 * MS, rel=0.01)
     assert ends[1].repaired
+
+
+def test_the_loss_of_messages_of_one_part_is_measured() -> None:
+    """Of a lost message no part arrives, and the receiver has nothing to report on."""
+    ends, random = (Exchange(1), Exchange(1)), Random(5)
+    loss, whole = 0.0, 0
+
+    def passes(payload: bytes) -> bool:
+        return not isinstance(decode(payload), PartMessage) or random.random() >= loss
+
+    for number in range(300):
+        loss = 0.0 if number < 100 else 0.3
+        ends[0].send(OBSERVATION, bytes(100))
+        pump(ends, passes, SECOND_NS)
+        ends[0].pace._free_ns = 0
+        if number == 99:
+            assert ends[0].pace.loss < 0.001
+        whole += number >= 120 and ends[1]._whole[OBSERVATION].newest == number
+    assert 0.2 < ends[0].pace.loss <= 0.4
+    assert whole >= 174  # of 180
+
+
+def test_a_message_that_was_overtaken_is_not_missed() -> None:
+    missed = Missed()
+    assert [missed.begin(number) for number in (0, 2, 1, 3, 6, 5, 9, 9, 8, 12, 2**62)] == [
+        *(0, 0, 0, 0, 0, 0, 1, 0, 0, 1, 2**62 - 14)
+    ]
 
 
 def test_a_message_that_has_begun_is_sent_to_its_end_and_of_those_that_wait_the_newest() -> None:
