@@ -25,12 +25,13 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorWrapper
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from skytether.gym.remote import PART_BYTES, ROWS_MAX, Network, Remote
+from skytether.gym.remote import ROWS_MAX, Network, Remote
 from skytether.gym.spaces import Space, idle_of, no_rows, observed, size_of, to_action, to_rows
 from skytether.netem.fate import Fates
 from skytether.netem.impairments.direction import Impairments, impairments
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.netem.link import QUEUE_BYTES_MAX
+from skytether.policy.form import PART_BYTES_MAX, PART_HEAD_BYTES
 from skytether.policy.players import Chunk, Clocked, Player, Row
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
@@ -43,8 +44,8 @@ if TYPE_CHECKING:
 else:
     _VectorWrapper = VectorWrapper  # generic only since gymnasium 1.4
 
-MTU = 1472
-"""Largest UDP payload of a datagram that has at most 1500 B with its headers [B]."""
+MTU = PART_BYTES_MAX + PART_HEAD_BYTES
+"""Largest UDP payload of a datagram of `skytether policy` [B]."""
 KEY = "network"
 """Key of `info` with all entries about the network."""
 Answer = Any
@@ -143,7 +144,7 @@ class _Far:
         self.price = number("price", price, 0.0, math.inf)
         self.step_ns = seconds_to_ns(number("step_s", step_s, 1e-3, 86_400.0))
         self.seed = _whole("seed", seed, 0, 2**63 - 1)
-        self._mtu = _whole("mtu", mtu, 2 * PART_BYTES, 65_507)
+        self._mtu = _whole("mtu", mtu, 2 * PART_HEAD_BYTES, 65_507)
         self._shown = _whole("shown_rows", shown_rows, 1, 4096)
         self.ways = _path("uplink", uplink), _path("downlink", downlink)
         self.thinking = None if thinking == "measured" else _thinking(thinking)
@@ -170,7 +171,7 @@ class _Far:
         mixed = int(stream(self._network_seed, "episode", self._episode).integers(2**32))
         network = Network(*self.ways, mixed, self._mtu)
         self.remote = Remote(
-            network, self._player, self.step_ns, self._none, self._shown, self._fill, self.count
+            network, self._player, self.step_ns, self._none, self._shown, self._fill
         )
         if self.thinking is not None:
             self._thoughts = Fates(self.thinking, mixed, "thinking", 0)

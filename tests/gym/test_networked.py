@@ -17,6 +17,8 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from numpy.typing import NDArray
 
 from skytether.gym import NOTHING_SENT, ORACLE, Chunk, Networked, NetworkedVector, Newest, Queue
+from skytether.policy.form import form_of
+from skytether.policy.pace import LOSS_FIRST
 from skytether.shared.base.errors import ConfigError
 
 BAD = {
@@ -130,13 +132,13 @@ def test_each_packet_costs_its_price_and_nothing_costs_nothing() -> None:
     env = Networked(Counting(), price=0.25, uplink="loss(1)")
     env.reset(seed=1)
     assert env.step(None)[1] == 1.0
-    _, reward, _, _, info = env.step(rows(1.0, 2.0))
-    assert reward == 0.75
+    _, reward, _, _, info = env.step(rows(1.0, 2.0))  # with as much parity, as it is urgent
+    assert reward == 0.5
     assert (
         info["network"]["uplink_packets"],
         info["network"]["lost"],
         info["network"]["acknowledged"],
-    ) == (1, 1, 0)
+    ) == (2, 2, 0)
 
 
 def test_the_agent_learns_the_delay_and_what_the_robot_plays_meanwhile() -> None:
@@ -234,7 +236,7 @@ def test_measured_thinking_is_charged_and_can_be_replayed() -> None:
 
 def test_a_vector_environment_has_a_network_for_all_and_a_fate_for_each() -> None:
     vector: Any = SyncVectorEnv([lambda: Counting(7), lambda: Counting(12)])
-    env = NetworkedVector(vector, uplink="constant(0.1)", downlink="constant(0.1)", price=0.5)
+    env = NetworkedVector(vector, uplink="constant(0.1)", downlink="constant(0.1)", price=0.25)
     observations, _ = env.reset(seed=1)
     assert observations.tolist() == [[0.0], [0.0]]
     for number in range(1, 7):
@@ -243,7 +245,7 @@ def test_a_vector_environment_has_a_network_for_all_and_a_fate_for_each() -> Non
         assert reward.tolist() == [1.0, 0.5]
     _, _, terminated, _, info = env.step([None, rows(1.0, 2.0)])
     assert terminated.tolist() == [True, False]
-    assert info["network"]["uplink_packets"].tolist() == [7, 7]
+    assert info["network"]["uplink_packets"].tolist() == [14, 14]  # 7 answers, with parity
     observations, *_ = env.step([np.ones(1), None])  # the first robot's next episode begins
     assert observations.tolist() == [[0.0], [7.0]]
     observations, _, _, _, info = env.step([None, None])
@@ -264,7 +266,7 @@ def test_robots_on_one_link_share_its_rate() -> None:
 
     def queued(count: int) -> float:
         vector = gymnasium.vector.SyncVectorEnv([Counting] * count)
-        env = NetworkedVector(vector, uplink="rate(1000)")
+        env = NetworkedVector(vector, uplink="rate(4000)")
         env.reset(seed=1)
         for _ in range(30):
             info = env.step([rows(1.0)] * count)[4]
@@ -393,7 +395,7 @@ class Telling(Counting):
 
 
 def test_the_environments_own_info_is_untouched_and_that_of_all_steps_is_there() -> None:
-    env = Networked(Telling(), thinking=0.25, price=0.5)
+    env = Networked(Telling(), thinking=0.25, price=0.25)
     assert list(env.reset(seed=1)[1]) == ["network"]
     _, reward, _, _, info = env.step(np.zeros(1))
     network = info.pop("network")
@@ -501,16 +503,21 @@ class Camera(Counting):
         return self.observed(), *outcome
 
 
-def test_a_picture_is_as_many_datagrams_as_it_takes_and_arrives_when_all_have() -> None:
-    """921 608 B in datagrams of 1472 B, 12 of them its own: none arrives whole at 10 % loss."""
+def test_a_picture_is_as_many_datagrams_as_it_takes_and_parity_follows_the_loss() -> None:
     env = Networked(Camera(), downlink="loss(10%)")
     env.reset(seed=1)
+    form = form_of(480 * 640 * 3 + 8 + 74, LOSS_FIRST)
+    assert (form.blocks, form.data) == (5, 165)
+    seen = list[int]()
     for number in range(1, 11):
         observation, *_, info = env.step(np.zeros(1))
-        assert observation["pixels"].max() == 0
-        assert info["network"]["downlink_packets"] == 632 * number
-    sent = 10 * (480 * 640 * 3 + 8 + 36 + 632 * (12 + 28))
-    assert info["network"]["downlink_bytes"] == sent
+        seen.append(int(observation["pixels"].max()))
+        if number == 1:
+            packets = form.blocks * (form.data + form.parity)
+            assert info["network"]["downlink_packets"] == packets
+            assert info["network"]["downlink_bytes"] == packets * (form.length + 40 + 28)
+    assert seen[0] == 0
+    assert seen[4:] == [5, 6, 7, 8, 9, 10]
 
 
 def test_a_picture_in_several_datagrams_waits_for_the_last_of_them() -> None:
@@ -526,25 +533,29 @@ def test_a_compressed_picture_counts_as_what_it_is_sent_as(compress: Any) -> Non
     env.reset(seed=1)
     observation, *_, info = env.step(np.zeros(1))
     assert observation["pixels"].min() == 1
-    assert info["network"]["downlink_packets"] == 21
-    assert info["network"]["downlink_bytes"] == 30_000 + 36 + 21 * (12 + 28)
+    form = form_of(30_000 + 74, LOSS_FIRST)
+    packets = form.data + form.parity
+    assert info["network"]["downlink_packets"] == packets
+    assert info["network"]["downlink_bytes"] == packets * (form.length + 40 + 28)
 
 
 def test_each_datagram_of_an_answer_costs_its_price() -> None:
     env = Networked(Counting(), price=0.25, mtu=100)
     env.reset(seed=1)
     _, reward, _, _, info = env.step(np.zeros((50, 1)))
-    assert info["network"]["uplink_packets"] == 5
-    assert reward == 1.0 - 5 * 0.25
+    packets = 2 * 8  # 460 B in parts of at most 60 B, and as many of parity
+    assert info["network"]["uplink_packets"] == packets
+    assert reward == 1.0 - packets * 0.25
     assert info["network"]["acknowledged"] == 1
 
 
-def test_a_flipped_bit_costs_the_whole_of_a_picture() -> None:
-    env = Networked(Camera(), downlink="corrupt(1%)", compress=lambda _: 1_500_000)
+@pytest.mark.parametrize(("corrupted", "last"), [("corrupt(1%)", 3), ("corrupt(60%)", 0)])
+def test_a_flipped_bit_costs_a_datagram_which_parity_may_restore(corrupted: str, last: int) -> None:
+    env = Networked(Camera(), downlink=corrupted, compress=lambda _: 1_500_000)
     env.reset(seed=1)
     for _ in range(3):
         observation, *_ = env.step(np.zeros(1))
-    assert observation["pixels"].max() == 0
+    assert observation["pixels"].max() == last
 
 
 class Choosing(Counting):
@@ -623,7 +634,7 @@ def test_dicts_of_spaces_are_taken_as_they_are() -> None:
     assert observation["joints"].tolist() == [1.0, 0.0]
     assert info["network"]["committed"]["gripper"][:1].tolist() == [2]
     rows = 4 * (2 * 4 + 8)
-    assert info["network"]["uplink_bytes"] == rows + 22 + 28
+    assert info["network"]["uplink_bytes"] == 2 * (rows + 60 + 40 + 28)
 
 
 def test_a_vector_of_dicts_has_answers_of_each_robot_or_a_batch_of_actions() -> None:
