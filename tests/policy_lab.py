@@ -1,7 +1,10 @@
 """Robot program and scripted policy in virtual time."""
 
 import json
+import subprocess
+import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -113,3 +116,19 @@ class Around:
 
     def outbox(self) -> Any:
         return [each for each in self.end.outbox() if self.leaves(each)]
+
+
+@contextmanager
+def process(*line: str) -> Iterator[str]:
+    """Run a process; its listening address, from its log."""
+    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as running:
+        try:
+            assert running.stdout
+            for said in running.stdout:
+                if "listening on" in said:
+                    break
+            threading.Thread(target=running.stdout.read, daemon=True).start()
+            yield said.partition("listening on ")[2].partition(",")[0]
+        finally:
+            running.terminate()
+            running.wait()

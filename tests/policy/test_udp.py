@@ -3,12 +3,11 @@
 import asyncio
 import json
 import socket
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +21,7 @@ from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
 from helpers import LOOPBACK, SKYTETHER, Idle, refused
-from policy_lab import messages, ramp
+from policy_lab import messages, process, ramp
 from skytether.__main__ import main
 from skytether.policy import PolicyError, Robot, values
 from skytether.shared.base.errors import ConfigError
@@ -72,22 +71,6 @@ def policy() -> Iterator[PolicyServer]:
     server = PolicyServer()
     yield server
     server.close()
-
-
-@contextmanager
-def process(*line: str) -> Iterator[str]:
-    """Run a process; its listening address, from its log."""
-    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as running:
-        try:
-            assert running.stdout
-            for said in running.stdout:
-                if "listening on" in said:
-                    break
-            threading.Thread(target=running.stdout.read, daemon=True).start()
-            yield said.partition("listening on ")[2].partition(",")[0]
-        finally:
-            running.terminate()
-            running.wait()
 
 
 def command(*argv: str) -> AbstractContextManager[str]:
