@@ -25,7 +25,7 @@ from skytether.netem.impairments.direction import Impairments
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
 from skytether.policy.committed import DELAYS, UnderWay
 from skytether.policy.form import PART_HEAD_BYTES, Form, form_of
-from skytether.policy.pace import LOSS_FIRST, Missed, filtered
+from skytether.policy.pace import LOSS_FIRST, Tally, filtered
 from skytether.policy.players import Chunk, Held, Player, Row
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
@@ -70,7 +70,7 @@ class Message:
     content: tuple[int, Held] | ObservationReport
     """Chunk, with the step of its observation; or report."""
     places: list[set[int]]
-    """Numbers of the parts of each block that have arrived."""
+    """Indices of the parts of each block that have arrived."""
 
     @property
     def parts(self) -> int:
@@ -97,20 +97,14 @@ class Way:
     """Number of messages so far."""
     whole: int = -1
     """Number of the newest complete message; earlier ones are not accepted any more."""
-    begun: Message | None = None
-    """Newest message of which a part has arrived, to be counted in the loss."""
-    lost: int = 0
-    """Number of messages before it of which no part has arrived."""
-    missed: Missed = field(default_factory=Missed)
+    tally: Tally = field(default_factory=Tally)
 
     def accept(self, part: Part) -> bool:
         """Accept a part; returns whether it completes its message."""
         message = part.message
-        if self.begun is None or message.number > self.begun.number:
-            if self.begun:
-                came = sum(map(len, self.begun.places))
-                self.loss = filtered(self.loss, self.begun.parts * (1 + self.lost), came)
-            self.begun, self.lost = message, self.missed.begin(message.number)
+        sent, came = self.tally.add(message.number, message.parts, (part.block, part.place))
+        if sent:
+            self.loss = filtered(self.loss, sent, came)
         message.places[part.block].add(part.place)
         if message.number <= self.whole:
             return False

@@ -12,7 +12,7 @@ from typing import Any
 from skytether.policy import parts
 from skytether.policy.form import PART_HEAD_BYTES, block_parts, form_of
 from skytether.policy.messages import STAMPS, PartMessage, Report, encode
-from skytether.policy.pace import RATE_MAX, Missed, Pace
+from skytether.policy.pace import RATE_MAX, Pace, Tally, filtered
 from skytether.policy.parts import Part, Reassembly
 from skytether.shared.base.units import HEADER_BYTES, MICROSECOND_NS, MILLISECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -25,22 +25,11 @@ REMEMBERED_MAX = 64
 
 
 @dataclass(slots=True)
-class _Sent:
-    """Message that has been sent at least in part."""
-
-    parts: int = 0
-    """Number of parts sent so far."""
-    was_limited: bool = False
-    """Whether the send rate delayed a part."""
-
-
-@dataclass(slots=True)
 class _Coming:
     """Message whose first parts have arrived, and on which no report has been sent."""
 
     number: int
     expected: int
-    missed: int
     first_ns: int
     last_ns: int = 0
     sent_us: int = 0
@@ -66,11 +55,14 @@ class Exchange:
         """Next message of each stream, sent after these parts, and whether it is urgent."""
         self._replies: deque[bytes] = deque(maxlen=REMEMBERED_MAX)
         """Encoded reports to be sent."""
-        self._sent: OrderedDict[tuple[int, int], _Sent] = OrderedDict()
+        self._sent: OrderedDict[tuple[int, int], bool] = OrderedDict()
+        """Whether the send rate delayed a part, by stream and number of a message."""
         self._numbers: dict[int, int] = {}
         self._coming: dict[int, _Coming] = {}
         self._whole: dict[int, Reassembly] = {}
-        self._missed: dict[int, Missed] = {}
+        self._tallies: dict[int, Tally] = {}
+        self._counted = [0, 0]
+        """Numbers of parts sent and received, of messages counted since the last report."""
         self._delay_us = 0
         """Newest one-way delay plus the unknown clock offset, without wrap-around [µs]."""
         self.sent = self.sent_bytes = self.dropped = self.came = self.repaired = 0
@@ -92,7 +84,7 @@ class Exchange:
         number = self._numbers[stream] = self._numbers.get(stream, -1) + 1
         form = form_of(len(message), self.pace.loss, is_urgent=is_urgent)
         self._queue[stream] = deque(parts.split(message, stream, number, form.parity))
-        self._sent[stream, number] = _Sent()
+        self._sent[stream, number] = False
         while len(self._sent) > REMEMBERED_MAX:
             self._sent.popitem(last=False)
 
@@ -128,13 +120,11 @@ class Exchange:
             self.pace.sent(size, now_ns)
             self.sent += 1
             self.sent_bytes += size
-            if noted := self._sent.get((stream, part.number)):
-                noted.parts += 1
             if not self._queue[stream] and stream in self._next:
                 self._begin(stream)
         for stream, queued in self._queue.items():
-            if queued and (noted := self._sent.get((stream, queued[0].number))):
-                noted.was_limited = True
+            if queued and (stream, queued[0].number) in self._sent:
+                self._sent[stream, queued[0].number] = True
         return out
 
     def accept(self, message: PartMessage, *, now_ns: int) -> bytes | None:
@@ -149,22 +139,26 @@ class Exchange:
         if coming and part.number > coming.number:
             self._report(stream, now_ns)
             coming = None
-        arrived = None
+        arrived = spare = None
         try:
             arrived = whole.accept(part)
         except ProtocolError as error:
-            is_spare = coming and part.number == coming.number and error.reason is not Drop.FIELD
-            if not is_spare:  # else a duplicate, or a surplus part of a complete message
+            if error.reason is Drop.FIELD:
                 raise
-        if coming is None:
-            count, _ = block_parts(part.size, part.blocks)
-            expected = part.blocks * (count + part.parity)
-            missed = self._missed.setdefault(stream, Missed()).begin(part.number)
-            coming = self._coming[stream] = _Coming(part.number, expected, missed, now_ns)
-        if part.number == coming.number:
+            spare = error  # a duplicate, or a surplus part of a complete message
+        count, _ = block_parts(part.size, part.blocks)
+        expected = part.blocks * (count + part.parity)
+        tally = self._tallies.setdefault(stream, Tally())
+        for i, more in enumerate(tally.add(part.number, expected, (part.block, part.place))):
+            self._counted[i] += more
+        if coming is None and spare is None:
+            coming = self._coming[stream] = _Coming(part.number, expected, now_ns)
+        if coming and part.number == coming.number:
             self._count(coming, message, now_ns)
             if len(coming.places) == coming.expected:
                 self._report(stream, now_ns)
+        elif spare:
+            raise spare
         if arrived is None:
             return None
         self.repaired += arrived.repaired
@@ -187,32 +181,34 @@ class Exchange:
             stream,
             coming.number,
             len(coming.places),
-            min(coming.missed, 255),
             min(coming.bytes, 2**32 - 1),
             (last_us - coming.sent_us) % STAMPS,
             min((coming.last_ns - coming.first_ns) // MICROSECOND_NS, STAMPS - 1),
             coming.sent_us,
             min((now_ns - coming.last_ns) // MICROSECOND_NS, STAMPS - 1),
+            *(min(each, 2**16 - 1) for each in self._counted),
         )
+        self._counted = [0, 0]
         self._replies.append(encode(seen))
 
     def learn(self, seen: Report, *, now_ns: int) -> None:
         """Update send rate and loss from the other end's report on a message."""
-        sent = self._sent.pop((seen.stream, seen.number), None)
-        if sent is None or not sent.parts:
+        if seen.counted:
+            self.pace.loss = filtered(self.pace.loss, seen.counted, seen.counted_came)
+        was_limited = self._sent.pop((seen.stream, seen.number), None)
+        if was_limited is None:
             return
         round_trip_us = (now_ns // MICROSECOND_NS - seen.sent_us - seen.held_us) % STAMPS
         # The clock offset is unknown, so the delay is unwrapped relative to the previous one.
         change_us = (seen.delay_us - self._delay_us + STAMPS // 2) % STAMPS - STAMPS // 2
         self._delay_us += change_us
         self.pace.heard(
-            sent.parts * (1 + seen.missed),
             seen.came,
             seen.bytes,
             self._delay_us * MICROSECOND_NS,
             round_trip_us * MICROSECOND_NS,
             seen.spread_us * MICROSECOND_NS,
-            was_limited=sent.was_limited,
+            was_limited=was_limited,
             now_ns=now_ns,
         )
 

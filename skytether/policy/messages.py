@@ -3,8 +3,8 @@
     HELLO    [1, 1, robot, boot_id, name]                         to the policy end, until answered
     WELCOME  [1, 2, robot, session, boot_id, server_boot_id, refusal]
     PART     [1, 20, session, stream, number, size, blocks, parity, block, place, sent_us, data]
-    REPORT   [1, 21, session, stream, number, came, missed, bytes, delay_us, spread_us, sent_us,
-              held_us]
+    REPORT   [1, 21, session, stream, number, came, bytes, delay_us, spread_us, sent_us, held_us,
+              counted, counted_came]
 
 The first two fields, version and type, are those of `shared.wire.protocol`, so that the same
 channels encrypt the datagrams. Times are in microseconds modulo 2^32.
@@ -82,8 +82,6 @@ class Report(NamedTuple):
     came: U16
     """Number of received parts; 0 marks a keep-alive, whose `number` is 1 if the robot end has the
     metadata."""
-    missed: U8
-    """Number of messages of which no part has arrived, found since the last report."""
     bytes: U32
     """Bytes of the received parts, headers included [B]."""
     delay_us: U32
@@ -95,6 +93,10 @@ class Report(NamedTuple):
     """`sent_us` of the last received part [µs]."""
     held_us: U32
     """Time between receiving that part and sending this report [µs]."""
+    counted: U16
+    """Number of parts sent of the messages counted since the last report, see `pace.Tally`."""
+    counted_came: U16
+    """Number of parts received of them."""
 
 
 Message = Hello | Welcome | PartMessage | Report

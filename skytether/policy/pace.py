@@ -31,30 +31,39 @@ LOSS_FIRST, LOSS_MAX = 0.02, 0.4
 """Packet loss ratio assumed before the first report, and largest estimate."""
 GAIN_UP, GAIN_DOWN = 0.3, 0.05
 """Filter gains for a reported loss above and below the estimate."""
-MISSED_AFTER = 3
-"""A message of which no part has arrived counts as lost when one arrives whose number is greater by
-more than this: messages may overtake each other."""
+OVERTAKEN_MAX = 3
+"""A message is counted in the loss when one arrives whose number is greater by more than this:
+messages may overtake each other."""
 
 
-class Missed:
-    """Messages of a stream of which no part has arrived, at its receiver."""
+class Tally:
+    """Parts sent and received of a stream's messages, counted by their receiver.
+
+    A message of which no part has arrived counts with as many parts as the newest message.
+    """
 
     def __init__(self) -> None:
-        self._checked: int | None = None
-        """Number of the first message that has not been checked; None before the first message."""
-        self._begun = set[int]()
-        """Later messages of which a part has arrived."""
+        self._open: dict[int, tuple[int, set[tuple[int, int]]]] = {}
+        """Number of parts of each message not counted yet, and block and index of those received.
+        """
+        self._first: int | None = None
+        """Number of the first message not counted yet; None before the first part."""
 
-    def begin(self, number: int) -> int:
-        """Add a message of which the first part arrives; returns how many are newly missed."""
-        self._begun.add(number)
-        checked = number if self._checked is None else self._checked
-        until = max(checked, number - MISSED_AFTER)
-        begun = {each for each in self._begun if each < until}
-        missed = until - checked - len(begun)
-        self._begun -= begun
-        self._checked = until
-        return max(missed, 0)
+    def add(self, number: int, parts: int, place: tuple[int, int]) -> tuple[int, int]:
+        """Add a received part, at a block and index, of a message of `parts` parts.
+
+        Returns: numbers of parts sent and received of messages that are now counted.
+        """
+        first = number if self._first is None else self._first
+        if number >= first:
+            self._open.setdefault(number, (parts, set()))[1].add(place)
+        self._first = max(first, number - OVERTAKEN_MAX)
+        if self._first == first:
+            return 0, 0
+        counted = [self._open.pop(each) for each in list(self._open) if each < self._first]
+        missed = self._first - first - len(counted)
+        sent = parts * missed + sum(each for each, _ in counted)
+        return sent, sum(len(places) for _, places in counted)
 
 
 def filtered(loss: float, sent: int, came: int) -> float:
@@ -95,7 +104,6 @@ class Pace:
 
     def heard(
         self,
-        sent: int,
         came: int,
         size: int,
         delay_ns: int,
@@ -105,10 +113,10 @@ class Pace:
         was_limited: bool,
         now_ns: int,
     ) -> None:
-        """Update the send rate and the loss from a report on a message.
+        """Update the send rate from a report on a message.
 
         Args:
-            sent, came: number of parts sent, also of missed messages, and of parts received.
+            came: number of parts received.
             size: bytes of the received parts [B].
             delay_ns: one-way delay of the last part, plus an unknown constant clock offset [ns].
             round_trip_ns: round-trip time of the last part, an upper bound of the queueing delay
@@ -117,7 +125,6 @@ class Pace:
             was_limited: whether the send rate delayed the message.
         """
         self.round_trip_ns = round_trip_ns
-        self.loss = filtered(self.loss, sent, came)
         if self._least and delay_ns - self._least[0][1] > round_trip_ns:
             self._least.clear()  # longer than the round-trip time: a clock was stepped
         while self._least and self._least[-1][1] >= delay_ns:

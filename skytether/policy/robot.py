@@ -277,7 +277,7 @@ class RobotEnd(Endpoint):
         """Send a keep-alive, which includes whether the policy's metadata has arrived."""
         assert self._exchange
         has = int(self._metadata is not None)
-        self._post(encode(Report(self._exchange.session, METADATA, has, 0, 0, 0, 0, 0, 0, 0)))
+        self._post(encode(Report(self._exchange.session, METADATA, has, 0, 0, 0, 0, 0, 0, 0, 0)))
 
     def _learn_metadata(self, message: bytes) -> None:
         try:

@@ -1,16 +1,20 @@
 """`policy.parts`, `policy.exchange`, `policy.pace`: parts, reassembly, send rate and loss."""
 
+from contextlib import suppress
 from random import Random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from policy_lab import Lab, state
 from skytether.policy import form, parts
 from skytether.policy.exchange import Exchange
 from skytether.policy.messages import OBSERVATION, PartMessage, Report, decode, encode
-from skytether.policy.pace import Missed
+from skytether.policy.pace import Tally
 from skytether.policy.parts import HELD_MAX, Part, Reassembly
+from skytether.policy.robot import RobotOptions
+from skytether.policy.virtual import NoActionError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX
@@ -183,11 +187,36 @@ def test_the_loss_of_messages_of_one_part_is_measured() -> None:
     assert whole >= 174  # of 180
 
 
-def test_a_message_that_was_overtaken_is_not_missed() -> None:
-    missed = Missed()
-    assert [missed.begin(number) for number in (0, 2, 1, 3, 6, 5, 9, 9, 8, 12, 2**62)] == [
-        *(0, 0, 0, 0, 0, 0, 1, 0, 0, 1, 2**62 - 14)
+def test_a_message_that_was_overtaken_is_not_lost() -> None:
+    tally = Tally()
+    numbers = (0, 2, 1, 3, 6, 5, 9, 9, 8, 12, 12, 2**62)
+    counted = [tally.add(number, 4, (0, 1)) for number in numbers]
+    assert counted == [
+        *([(0, 0)] * 4),
+        (3 * 4, 3),  # 0, 1 and 2
+        (0, 0),
+        (3 * 4, 2),  # 4 has not arrived
+        *([(0, 0)] * 2),
+        (3 * 4, 2),  # nor has 7
+        (0, 0),
+        ((2**62 - 12) * 4, 2),
     ]
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.1])
+def test_jitter_is_no_loss(loss: float) -> None:
+    """Parts overtake those of the next messages, at intervals shorter than the jitter."""
+    jitter = f"gamma(50ms, 100ms, 20ms) & loss({loss})"
+    options = RobotOptions("absolute", MS, step_ns=50 * MS, plays_on=True)
+    lab, losses = Lab(options=options, to_policy=jitter, to_robot=jitter), list[float]()
+    lab.connect()
+    for number in range(200):
+        with suppress(NoActionError):
+            lab.infer(state(0.0))
+        lab.sleep(0.049)
+        if number >= 100:
+            losses.append(lab.robot.figures()["link"]["loss"])
+    assert loss <= sum(losses) / 100 <= 0.02 + 2.5 * loss
 
 
 def test_a_message_that_has_begun_is_sent_to_its_end_and_of_those_that_wait_the_newest() -> None:
