@@ -8,9 +8,10 @@
     spaces     actions as rows, and the size of observations, for any of Gymnasium's spaces
     flights    Skytether's own flights, in which the agent is the trigger
 
-`skytether.policy.players` has the rules by which a robot chooses actions from chunks.
-Importing `flights` registers `skytether/Target-v0` with Gymnasium. The package imports `sim`,
-`netem`, `server` and `shared`; no package imports `gym`. It needs the extra `gym`.
+`skytether.policy` has the rules: `players` choose a robot's actions from chunks, `committed`
+predicts these actions, `form` and `pace` choose the datagrams of a message. Importing `flights`
+registers `skytether/Target-v0` with Gymnasium. The package imports `sim`, `policy`, `netem`,
+`server` and `shared`; no package imports `gym`. It needs the extra `gym`.
 """
 
 from skytether.shared.base import extras

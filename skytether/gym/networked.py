@@ -70,7 +70,7 @@ class Options(TypedDict, total=False):
     """Thinking time of an answer: a number [s], a distribution such as "gamma(20ms, 80ms, 30ms)",
     or "measured": the real time until `step` is called."""
     price: float
-    """Cost of each datagram of an answer, subtracted from the reward."""
+    """Cost of each datagram with an answer or its parity, subtracted from the reward."""
     seed: int
     """Seed of the network. `reset(seed=…)` restarts the network's random numbers from both seeds; a
     `reset` without a seed draws new random numbers for the next episode."""
@@ -87,8 +87,8 @@ class Options(TypedDict, total=False):
     clock_ns: Callable[[], int]
     """Function that returns the time [ns]; used if `thinking` is "measured"."""
     mtu: int
-    """Largest UDP payload of a datagram [B], without 28 B of headers. A longer observation or
-    answer is split into several datagrams, and arrives with the last of them."""
+    """Largest UDP payload of a datagram [B], without 28 B of headers. An observation or answer is
+    sent in one or several datagrams and parity, see `skytether.policy.form`."""
     compress: Compress | None
     """Function that returns an observation's compressed bytes, or the number of these bytes. Only
     their number matters: the agent sees the observation itself."""

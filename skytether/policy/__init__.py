@@ -12,7 +12,8 @@
 | `robot`, `serving` | robot end and policy end, `RobotEnd` and `PolicyEnd`, without input/output |
 | `schedule`, `players` | received action chunks, and the row to execute at each control step |
 | `committed` | prediction of the rows that a robot executes until a new chunk can arrive |
-| `exchange`, `parts`, `pace` | messages as datagrams with parity, at an estimated send rate |
+| `exchange`, `form`, `parts` | messages as datagrams with parity |
+| `pace` | estimated packet loss ratio and send rate |
 | `messages` | datagram format |
 | `values`, `images` | serialization of observations and actions |
 | `web` | websocket connections to the robot program and the policy server |
@@ -21,9 +22,9 @@
 | `command` | `skytether policy serve` and `skytether policy join` |
 | `virtual` | both ends over an emulated network, in virtual time |
 
-`gym` uses the same `players`. The package imports `shared`, `client` and `server` for links with
-and without keys, `netem` in `virtual`, and `shell` where it opens sockets. It needs the extra
-`policy`.
+`gym` uses the same `players`, `committed`, `form` and `pace`. The package imports `shared`,
+`client` and `server` for links with and without keys, `netem` in `virtual`, and `shell` where it
+opens sockets. It needs the extra `policy`.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -36,7 +37,7 @@ __all__ = ["PolicyError", "Robot", "serve"]
 if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
-        # Imported on first use: `gym` needs only `players`, without the extra `policy`.
+        # Imported on first use: `gym` needs only some modules, without the extra `policy`.
         if name not in __all__:
             raise AttributeError(f"module 'skytether.policy' has no attribute {name!r}")
         from skytether.shared.base import extras
