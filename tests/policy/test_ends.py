@@ -385,6 +385,20 @@ def test_committed_rows_are_executed_also_with_several_chunks_under_way() -> Non
         assert rows == executed[step : step + 7]
 
 
+def test_chunks_under_way_to_the_previous_program_are_not_predicted() -> None:
+    lab = Lab(to_policy="constant(60ms)", to_robot="constant(60ms)", gives_rows=True)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.say(FrameType.MESSAGE.value + values.pack(state(1.0)))
+    lab.sleep(0.1)  # its chunk is under way
+    lab.say(FrameType.OPENED.value, ("program", 2))
+    lab.say(FrameType.MESSAGE.value + values.pack(state(9.0)), ("program", 2))
+    lab.sleep(0.2)
+    assert lab.asked[-1]["state"][0] == 9.0
+    assert "coming" not in lab.asked[-1]
+    assert lab.asked[-1]["delay_steps"] == 6
+
+
 @pytest.mark.parametrize(
     "coming",
     [
