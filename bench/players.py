@@ -148,7 +148,7 @@ class FlownCell(msgspec.Struct, frozen=True):
     cell: Cell
     score: float
     packets_per_s: float
-    """Answers sent a second."""
+    """Datagrams with answers, parity included, a second."""
 
 
 def differs(task: Any, rows: Rows, coming: Rows) -> bool:
