@@ -84,7 +84,7 @@ def test_a_free_key_is_read_as_it_is_meant() -> None:
         (Free("control.trigger", 1.0, 2.0), "got control.trigger, expected the key of a number"),
         (
             Free("reference.radius_m", 3.0, 5.0),
-            "reference.radius_m: got the bounds 3 to 5, expected them to hold",
+            "reference.radius_m: got the bounds 3 to 5, expected bounds around 1.55",
         ),
     ],
 )

@@ -269,7 +269,7 @@ def test_a_kml_path_on_the_ground_has_two_axes() -> None:
                 .replace("<when>", "<w>")
                 .replace("</when>", "</w>")
             ),
-            "as many times",
+            "a time per place",
         ),
         (kml(line("8,47,1 8,47,2")).replace("</kml>", "<NetworkLink/></kml>"), "without links"),
         ("<!DOCTYPE k [<!ENTITY a 'b'>]>" + kml("&a;"), "document type"),

@@ -37,7 +37,7 @@ def margins(argv: Sequence[str]) -> None:
 
     The vehicle hovers in virtual time, over the scenario's network. After a weak push:
 
-      growth   of the mean square of the deviation per step; below 1 the loop is stable
+      growth   of the mean square deviation per step; below 1: stable
 
     In the scenario's white wind and noise, if the loop is stable:
 
