@@ -42,7 +42,8 @@ class ProgramGone(RobotEvent):
 
 
 class Holding(RobotEvent):
-    sentence = "robot {robot}: no row remains; executing the hold action"
+    sentence = "robot {robot}: no row remains: {reason}; executing the hold action"
+    reason: str
 
 
 class PlaysAgain(RobotEvent):

@@ -48,6 +48,8 @@ LINE = 1
 """Socket number of the local connection to the robot program or the policy."""
 SILENCE_NS = 3 * SECOND_NS
 """Time without a datagram after which the robot end sends HELLO again [ns]."""
+SILENT_NS = SECOND_NS // 2
+"""Time without a datagram that counts as the reason for a hold [ns]."""
 ALIVE_NS = SECOND_NS
 """Time after the last sent datagram at which a keep-alive is sent [ns]."""
 AGAIN_NS = SECOND_NS
@@ -163,6 +165,18 @@ class _Program:
     has_metadata: bool = False
 
 
+@dataclass(slots=True)
+class _SinceChunk:
+    """Events since the newest chunk, from which the reason for a hold follows."""
+
+    sent: int = 0
+    """Number of observations sent."""
+    reported: int = 0
+    """Number of observations of which the policy end has reported parts."""
+    fault: str = ""
+    """Newest error of the policy, or reason for refusing a chunk."""
+
+
 class RobotEnd(Endpoint):
     """Robot end of a session with a policy end.
 
@@ -216,6 +230,7 @@ class RobotEnd(Endpoint):
         self._late_ns = 0
         """Longest time by which an answer exceeded its deadline [ns]."""
         self._is_holding = False
+        self._since = _SinceChunk()
         self._age_ns = -1
         """Age of the newest chunk's observation at the last answer [ns]; -1: no chunk."""
         self._left = 0
@@ -250,6 +265,7 @@ class RobotEnd(Endpoint):
         if isinstance(message, Report):
             if message.came:
                 exchange.learn(message, now_ns=now_ns)
+                self._since.reported += message.stream == OBSERVATION
         elif arrived := exchange.accept(message, now_ns=now_ns):
             if message.stream == METADATA:
                 self._learn_metadata(arrived)
@@ -392,6 +408,7 @@ class RobotEnd(Endpoint):
         while len(self._asked) > ASKED_MAX:
             del self._asked[next(iter(self._asked))]
         call.message, call.sent = message, compressed
+        self._since.sent += 1
         if self._exchange:
             self._exchange.send(OBSERVATION, message)
         before = self._asked.get(call.number - 1)
@@ -425,6 +442,7 @@ class RobotEnd(Endpoint):
         call = self._call
         if error:
             self._events.append(events.PolicyFailed(robot=self._robot, reason=error[:200]))
+            self._since.fault = f"error of the policy: {error[:200]}"
             return
         if program.newest < 0 and (call is None or call_number < call.number):
             why = "its call was answered with an error, and the robot may have been moved since"
@@ -437,10 +455,12 @@ class RobotEnd(Endpoint):
             schedule.accept(call_number, asked.first, stood_ns, content, now_ns=now_ns)
         except ValueError as refused:
             self._events.append(events.ChunkRefused(robot=self._robot, reason=str(refused)))
+            self._since.fault = f"its chunk is refused: {refused}"
             return
         self._delays_ns.append(delay_ns)
         if call_number > program.newest:
             program.newest, program.made_ns = call_number, asked.began_ns
+            self._since = _SinceChunk()
         if call and (call.number == call_number or call.is_first):
             self._answer(Kind.FRESH, now_ns)
 
@@ -466,7 +486,8 @@ class RobotEnd(Endpoint):
                 error = f"no action from the policy for {held_s:.2f} s"
             if not self._is_holding:
                 self._is_holding = True
-                self._events.append(events.Holding(robot=self._robot))
+                why = self._why_no_row(call, since_ns, now_ns)
+                self._events.append(events.Holding(robot=self._robot, reason=why))
         elif self._is_holding and not error:
             self._is_holding = False
             self._events.append(events.PlaysAgain(robot=self._robot, after_s=held_s))
@@ -486,6 +507,21 @@ class RobotEnd(Endpoint):
             self.send(FrameType.ERROR.value + error.encode(), program.peer, LINE)
         else:
             self.send(FrameType.MESSAGE.value + message, program.peer, LINE)
+
+    def _why_no_row(self, call: _Call, since_ns: int, now_ns: int) -> str:
+        """Reason why no row remains since `since_ns`, as far as this end can tell."""
+        since, silence_ns = self._since, now_ns - self._heard_ns
+        if self._exchange is None:
+            return "no session with `policy serve`"
+        if since.fault:
+            return since.fault
+        if since.sent <= 1 and call.began_ns > since_ns:
+            pause_s = (call.began_ns - since_ns) / SECOND_NS
+            return f"the program made no call for {pause_s:.2f} s after its last row"
+        if silence_ns >= SILENT_NS:
+            return f"no datagram from `policy serve` for {silence_ns / SECOND_NS:.1f} s"
+        counts = f"{since.reported} of the last {since.sent} observations"
+        return f"by its reports {counts} have reached `policy serve`, but no chunk has arrived here"
 
     # -- time ----------------------------------------------------------------------------------
 

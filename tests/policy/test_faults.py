@@ -19,7 +19,7 @@ from policy_lab import (
     state,
 )
 from skytether.client.secure import SecureLink
-from skytether.policy import metrics, values
+from skytether.policy import events, metrics, values
 from skytether.policy.exchange import Exchange
 from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
@@ -461,3 +461,46 @@ def test_every_figure_is_a_metric() -> None:
         assert not unknown
         names = {each.name for each in exposed}
         assert {each.exposed().name for each in own} <= names
+
+
+def holds_because(lab: Lab) -> list[str]:
+    """Reasons of the holds so far."""
+    return [each.reason for each in lab.robot.events() if isinstance(each, events.Holding)]
+
+
+def long_ramp(seen: Any) -> Any:
+    return {"actions": seen["state"][0] + np.arange(40.0)[:, None]}
+
+
+def broken_line(seen: Any) -> Any:
+    if seen["state"][0] > 25.0:
+        raise RuntimeError("no memory")
+    return ramp(seen)
+
+
+@pytest.mark.parametrize(
+    ("options", "cut", "pause_s", "reason"),
+    [
+        ({}, True, 0.0, "no datagram from `policy serve` for 0.5 s"),
+        ({"policy": long_ramp}, True, 0.0, "no datagram from `policy serve` for 1.1 s"),
+        ({"policy": broken_line}, False, 0.0, "error of the policy: no memory"),
+        ({}, False, 3.0, "the program made no call for 2.8"),
+    ],
+)
+def test_a_hold_says_why_no_row_remains(
+    options: dict[str, Any], cut: bool, pause_s: float, reason: str
+) -> None:
+    lab, position = flying(**options)
+    lab.is_cut = cut
+    lab.sleep(pause_s)
+    fly(lab, 12, position)
+    (why, *_) = holds_because(lab)
+    assert why.startswith(reason)
+
+
+def test_a_hold_because_of_a_slow_policy_says_what_has_arrived() -> None:
+    lab, position = flying()
+    lab.thinking_ns = None
+    fly(lab, 8, position)
+    (why,) = holds_because(lab)
+    assert why.startswith("by its reports 2 of the last 2 observations have reached")

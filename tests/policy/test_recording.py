@@ -37,7 +37,7 @@ def test_images_are_recorded_as_they_were_sent(tmp_path: Path) -> None:
     sent = Compressor(raw=["images/top"])(seen)
     written.note(answered(1, sent, {"actions": np.array([[1, 2]])}))
     written.note(answered(2))
-    written.hear(events.Holding(robot=1))
+    written.hear(events.Holding(robot=1, reason="no session"))
     assert written.close() == ""
     found = dict(messages(tmp_path / "a.mcap"))
     jpeg = found["/images/wrist"]
@@ -47,7 +47,7 @@ def test_images_are_recorded_as_they_were_sent(tmp_path: Path) -> None:
     assert (raw["width"], raw["height"], raw["step"]) == (64, 48, 192)
     assert b64decode(raw["data"]) == GREY.tobytes()
     assert found["/observation"] == {"call": 1, "state": [1.5, None], "map": "float64 (100, 100)"}
-    assert found["/events"]["message"] == str(events.Holding(robot=1))
+    assert found["/events"]["message"] == str(events.Holding(robot=1, reason="no session"))
     answers = [each for topic, each in messages(tmp_path / "a.mcap") if topic == "/answers"]
     assert [each["actions"] for each in answers] == [[[1, 2]], None]
 
