@@ -484,7 +484,7 @@ def broken_line(seen: Any) -> Any:
         ({}, True, 0.0, "no datagram from `policy serve` for 0.5 s"),
         ({"policy": long_ramp}, True, 0.0, "no datagram from `policy serve` for 1.1 s"),
         ({"policy": broken_line}, False, 0.0, "error of the policy: no memory"),
-        ({}, False, 3.0, "the program made no call for 2.8"),
+        ({"thinking": 0.14}, False, 3.0, "the program made no call for 3.00 s"),
     ],
 )
 def test_a_hold_says_why_no_row_remains(
