@@ -8,7 +8,7 @@ from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 
@@ -16,8 +16,8 @@ from skytether.policy import inside, metrics, web
 from skytether.policy.images import QUALITY, Compressor
 from skytether.policy.pace import RATE_MAX, RATE_MIN
 from skytether.policy.players import Clocked, Freshest, Player, Queue
-from skytether.policy.recording import CallRecording
 from skytether.policy.robot import RobotEnd, RobotOptions
+from skytether.shared.base import extras
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Endpoint
 from skytether.shared.events.flight import Event
@@ -33,6 +33,9 @@ from skytether.shell.host.udp import AddressError, is_loopback
 from skytether.shell.processes.log import Log, LogFormat
 from skytether.shell.processes.metrics import Metric
 from skytether.shell.processes.process import serving
+
+if TYPE_CHECKING:
+    from skytether.policy.recording import CallRecording
 
 PLAYERS: dict[str, Callable[[], Player]] = {
     "clock": Clocked,
@@ -252,8 +255,10 @@ def join(argv: Sequence[str]) -> None:
 
 
 @contextmanager
-def _recorded(path: Path, key: str) -> Iterator[CallRecording]:
+def _recorded(path: Path, key: str) -> Iterator["CallRecording"]:
     """Record calls to a file; if the disk fails, calls are answered and the command fails."""
+    with extras.named("record"):
+        from skytether.policy.recording import CallRecording
     try:
         recording = CallRecording(path, key)
     except OSError as error:

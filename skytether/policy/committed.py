@@ -17,8 +17,8 @@ from skytether.policy.players import Held, Player, Row
 
 DELAYS = 64
 """Number of newest delays of which the longest is the delay bound."""
-UNDER_WAY_MAX = 1024
-"""Largest number of chunks under way that are remembered; the oldest are forgotten."""
+UNDER_WAY_MAX, BYTES_MAX = 1024, 16_000_000
+"""Largest number and total size [B] of chunks under way; the oldest are forgotten."""
 
 
 class RobotRows(NamedTuple):
@@ -40,17 +40,24 @@ class UnderWay:
     def __init__(self) -> None:
         self._sent: OrderedDict[int, tuple[int, Held]] = OrderedDict()
         """Chunks by generation, each with the step of its observation."""
+        self._bytes = 0
+        """Total size of their rows [B]."""
 
     def add(self, made: int, chunk: Held) -> None:
         """Add a chunk computed from the observation of the step `made`."""
         self._sent[chunk.generation] = made, chunk
-        if len(self._sent) > UNDER_WAY_MAX:
-            self._sent.popitem(last=False)
+        self._bytes += chunk.rows.nbytes
+        while len(self._sent) > UNDER_WAY_MAX or self._bytes > BYTES_MAX:
+            self._forget()
 
     def acknowledge(self, generation: int) -> None:
         """Forget chunks up to this one, which the robot has; earlier ones are lost or replaced."""
         while self._sent and next(iter(self._sent)) <= generation:
-            self._sent.popitem(last=False)
+            self._forget()
+
+    def _forget(self) -> None:
+        """Forget the oldest chunk."""
+        self._bytes -= self._sent.popitem(last=False)[1][1].rows.nbytes
 
     def predict(
         self,

@@ -88,6 +88,10 @@ class Exchange:
         while len(self._sent) > REMEMBERED_MAX:
             self._sent.popitem(last=False)
 
+    def number(self, stream: int) -> int:
+        """Number of the stream's newest message of which parts were sent; -1 if there is none."""
+        return self._numbers.get(stream, -1)
+
     def is_sending(self, stream: int) -> bool:
         """Whether parts of a message of this stream remain to be sent."""
         return bool(self._queue.get(stream))

@@ -14,6 +14,7 @@ import threading
 import time
 from base64 import b64encode
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,10 +31,15 @@ from skytether.shared.events.flight import Event
 
 VALUES_MAX = 256
 """Largest number of elements of an array in `/observation`; of a larger one the shape is given."""
+ACTIONS_MAX = 16_384
+"""Largest number of elements of the actions in `/answers`."""
 WAITING_MAX = 64
 """Largest number of messages that wait for the disk; further ones are not recorded."""
-FLUSH_S = 0.25
-"""Interval at which the file is written [s]; a killed process loses at most this much."""
+FLUSH_S, CHUNK_BYTES = 0.25, 16 * 1024
+"""Interval at which complete chunks are written [s], and size of a chunk [B]. A killed process
+loses the last chunk."""
+CLOSING_S = 5.0
+"""Longest time to wait for the disk at the end [s]."""
 INFO = 2
 _TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
 _BYTES = {"type": "string", "contentEncoding": "base64"}
@@ -85,7 +91,7 @@ class CallRecording:
 
     def __init__(self, path: Path, key: str) -> None:
         self._growing, self._key = files.Growing(path), key
-        self._writer = Writer(self._growing.file, enable_data_crcs=True)
+        self._writer = Writer(self._growing.file, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
         self._writer.start(profile="", library="skytether")
         self._channels: dict[tuple[str, str], int] = {}
         self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(WAITING_MAX)
@@ -102,15 +108,21 @@ class CallRecording:
 
     def hear(self, event: Event) -> None:
         """Record a log event."""
-        self._put(partial(self._add_event, time.time_ns(), str(event)))
+        self._put(partial(self._add_event, time.monotonic_ns(), str(event)))
 
     def close(self) -> str:
         """Complete the file; returns why the recording is incomplete, or an empty text."""
-        self._waiting.put(None)
-        self._thread.join()
-        self._growing.end(empty=False, whole=not self._fault)
+        with suppress(queue.Full):  # then the thread does not end in time
+            self._waiting.put(None, timeout=CLOSING_S)
+        self._thread.join(CLOSING_S)
+        if self._thread.is_alive():
+            return f"{self._growing.at}: the disk has not taken the end within {CLOSING_S:g} s"
+        try:
+            self._growing.end(empty=not self._channels, whole=not self._fault)
+        except OSError as error:
+            self._fault = f"cannot be completed: {error.strerror}"
         if self._missed and not self._fault:
-            self._fault = f"{self._missed} messages are missing, because the disk was too slow"
+            self._fault = f"{self._missed} messages are missing: slow disk, or a value has no JSON"
         return f"{self._growing.at}: {self._fault}" if self._fault else ""
 
     def _put(self, action: Callable[[], None]) -> None:
@@ -125,7 +137,10 @@ class CallRecording:
         try:
             flushed_s = time.monotonic()
             for action in actions:
-                action()
+                try:
+                    action()
+                except (TypeError, ValueError):
+                    self._missed += 1
                 if time.monotonic() - flushed_s >= FLUSH_S:
                     self._growing.file.flush()
                     flushed_s = time.monotonic()
@@ -145,7 +160,7 @@ class CallRecording:
             else:
                 numbers[name] = _small(value)
         if call.sent is not None:
-            self._add("/observation", "skytether.Observation", {"call": call.number, **numbers})
+            self._add("/observation", "skytether.Observation", numbers | {"call": call.number})
         self._now_ns = call.time_ns + self._offset_ns
         rows = call.reply.get(self._key) if isinstance(call.reply, dict) else None
         answer = {
@@ -154,12 +169,12 @@ class CallRecording:
             "waited_s": call.waited_ns / SECOND_NS,
             "chunk_age_s": None if call.chunk_age_ns < 0 else call.chunk_age_ns / SECOND_NS,
             "left": call.left,
-            "actions": _small(rows),
+            "actions": _small(rows, ACTIONS_MAX),
         }
         self._add("/answers", "skytether.Answer", answer)
 
     def _add_event(self, now_ns: int, sentence: str) -> None:
-        self._now_ns = now_ns
+        self._now_ns = now_ns + self._offset_ns
         log = {"level": INFO, "message": sentence, "name": "policy join", "file": "", "line": 0}
         self._add_drawn("/events", "foxglove.Log", log)
 
@@ -182,6 +197,9 @@ def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
     if isinstance(value, dict) and JPEG not in value:
         for name, each in value.items():
             yield from _leaves(each, f"{key}/{name}" if key else str(name))
+    elif isinstance(value, list) and len(value) <= VALUES_MAX:
+        for i, each in enumerate(value):
+            yield from _leaves(each, f"{key}/{i}")
     elif value is not None:
         yield key, value
 
@@ -204,10 +222,10 @@ def _image(value: Any) -> tuple[str, dict[str, Any]] | None:
     }
 
 
-def _small(value: Any) -> Any:
-    """Value for JSON: a small array as lists, other data by type and shape."""
+def _small(value: Any, most: int = VALUES_MAX) -> Any:
+    """Value for JSON: an array of up to `most` elements as lists, other data by type and shape."""
     if isinstance(value, np.ndarray | np.generic):
-        if value.size <= VALUES_MAX and value.dtype.kind in "biuf":
+        if value.size <= most and value.dtype.kind in "biuf":
             return value.tolist()
         return f"{value.dtype} {value.shape}"
     if isinstance(value, bool | int | float | str) or value is None:

@@ -16,7 +16,7 @@ A frame of the local connection begins with a byte of `FrameType`.
 
 from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
 
@@ -48,10 +48,10 @@ LINE = 1
 """Socket number of the local connection to the robot program or the policy."""
 SILENCE_NS = 3 * SECOND_NS
 """Time without a datagram after which the robot end sends HELLO again [ns]."""
-SILENT_NS = SECOND_NS // 2
-"""Time without a datagram that counts as the reason for a hold [ns]."""
 ALIVE_NS = SECOND_NS
 """Time after the last sent datagram at which a keep-alive is sent [ns]."""
+SILENT_NS = ALIVE_NS + SECOND_NS // 2
+"""Time without a datagram that counts as the reason for a hold [ns]."""
 AGAIN_NS = SECOND_NS
 """Time between repetitions of the first observation [ns]."""
 STEP_NS_FIRST = 50 * MILLISECOND_NS
@@ -144,6 +144,8 @@ class _Asked(NamedTuple):
     began_ns: int
     first: int
     """Step of the first row of its chunk."""
+    step: int
+    """Control step of the observation."""
     stood_ns: float
     """`Schedule.stood_ns` at the observation [ns]."""
 
@@ -163,6 +165,8 @@ class _Program:
     answered_ns: int | None = None
     """Time of the last answer [ns]."""
     has_metadata: bool = False
+    answers_first: bool = False
+    """Whether the newest chunk is the program's first."""
 
 
 @dataclass(slots=True)
@@ -171,8 +175,10 @@ class _SinceChunk:
 
     sent: int = 0
     """Number of observations sent."""
-    reported: int = 0
-    """Number of observations of which the policy end has reported parts."""
+    first: int = 0
+    """Number of the first message with one of these observations."""
+    reported: set[int] = field(default_factory=set)
+    """Numbers of these messages of which the policy end has reported parts."""
     fault: str = ""
     """Newest error of the policy, or reason for refusing a chunk."""
 
@@ -210,8 +216,10 @@ class RobotEnd(Endpoint):
         before the first."""
         self._hello_ns: int | None = 0
         """Time of the next HELLO [ns]; None during a session."""
-        self._heard_ns = self._sent_ns = 0
+        self._heard_ns = self._sent_ns = self._alive_ns = 0
         self._metadata: bytes | None = None
+        self._has_metadata = False
+        """Whether the metadata of this run of the policy end have arrived."""
         self._wants_rows = False
         """Whether observations include the next rows, for `PolicyEnd.gives_rows`."""
         self._program: _Program | None = None
@@ -222,8 +230,9 @@ class RobotEnd(Endpoint):
         self._waits = True
         """Whether the newest chunk arrived within the deadline; otherwise calls are answered at
         once while rows remain."""
-        self._delays_ns: deque[int] = deque(maxlen=DELAYS)
-        """Newest times from an observation to its chunk [ns]."""
+        self._delays: deque[tuple[int, int]] = deque(maxlen=DELAYS)
+        """Of the newest chunks: time from its observation [ns], and number of rows executed
+        meanwhile, which the chunk could not change."""
         self._counts = Counter[Kind]()
         self._drops = Counter[str]()
         self._refused = 0
@@ -265,7 +274,8 @@ class RobotEnd(Endpoint):
         if isinstance(message, Report):
             if message.came:
                 exchange.learn(message, now_ns=now_ns)
-                self._since.reported += message.stream == OBSERVATION
+                if message.stream == OBSERVATION and message.number >= self._since.first:
+                    self._since.reported.add(message.number)
         elif arrived := exchange.accept(message, now_ns=now_ns):
             if message.stream == METADATA:
                 self._learn_metadata(arrived)
@@ -285,14 +295,19 @@ class RobotEnd(Endpoint):
         if self._session == session:
             return
         self._session = session
-        self._exchange = Exchange(welcome.session, self._options.rate_max)
+        self._exchange, self._has_metadata = (
+            Exchange(welcome.session, self._options.rate_max),
+            False,
+        )
+        self._since.first = 0  # the messages of a session are counted from 0
         self._events.append(events.PolicyJoined(robot=self._robot, peer=address_text(*peer)))
-        self._say_alive()
+        self._say_alive(now_ns)
 
-    def _say_alive(self) -> None:
+    def _say_alive(self, now_ns: int) -> None:
         """Send a keep-alive, which includes whether the policy's metadata has arrived."""
         assert self._exchange
-        has = int(self._metadata is not None)
+        self._sent_ns = self._alive_ns = now_ns
+        has = int(self._has_metadata)
         self._post(encode(Report(self._exchange.session, METADATA, has, 0, 0, 0, 0, 0, 0, 0, 0)))
 
     def _learn_metadata(self, message: bytes) -> None:
@@ -303,6 +318,7 @@ class RobotEnd(Endpoint):
         if not isinstance(metadata, bytes):
             raise ProtocolError(Drop.FIELD)
         self._wants_rows, self._metadata = wants_rows is True, metadata
+        self._has_metadata = True
         self._greet()
 
     def _post(self, payload: bytes) -> None:
@@ -327,9 +343,9 @@ class RobotEnd(Endpoint):
             self._post(payload)
         if posted:
             self._sent_ns = now_ns
-        elif now_ns - self._sent_ns >= ALIVE_NS:
-            self._sent_ns = now_ns
-            self._say_alive()
+        since_ns = self._sent_ns if self._has_metadata else self._alive_ns
+        if now_ns - since_ns >= ALIVE_NS:
+            self._say_alive(now_ns)
 
     # -- robot program -------------------------------------------------------------------------
 
@@ -393,7 +409,7 @@ class RobotEnd(Endpoint):
                 acknowledged = max(program.newest, next(iter(self._asked), call.number) - 1)
                 rows = schedule.coming(ROWS_SENT, now_ns=now_ns)
                 held = RobotRows(options.key, number, acknowledged, rows)
-            left, delay = schedule.left(now_ns=now_ns), self._delay_steps(schedule)
+            left, delay = schedule.left(now_ns=now_ns), self._delay_steps()
             content = [call.number, left, delay, held, seen]
             message = values.pack(content)
             if len(message) > values.BYTES_MAX:
@@ -404,7 +420,9 @@ class RobotEnd(Endpoint):
             self._events.append(refused)
             self._answer(Kind.ERROR, now_ns, f"the observation is refused: {error}")
             return
-        self._asked[call.number] = _Asked(now_ns, number, schedule.stood_ns)
+        self._asked[call.number] = _Asked(
+            now_ns, number, schedule.advance(now_ns=now_ns), schedule.stood_ns
+        )
         while len(self._asked) > ASKED_MAX:
             del self._asked[next(iter(self._asked))]
         call.message, call.sent = message, compressed
@@ -417,15 +435,14 @@ class RobotEnd(Endpoint):
         if not (self._waits or call.is_first) and schedule.left(now_ns=now_ns):
             self._answer(Kind.REST, now_ns)
 
-    def _delay_steps(self, schedule: Schedule) -> int:
-        """Longest of the newest times from an observation to its chunk, in control steps."""
-        longest_ns = max(self._delays_ns, default=0)
-        return -(-longest_ns // schedule.step_ns)
+    def _delay_steps(self) -> int:
+        """Largest number of rows executed before a chunk could change them."""
+        return max((steps for _, steps in self._delays), default=0)
 
     def _is_needed(self, schedule: Schedule, now_ns: int) -> bool:
         spare = self._options.spare_rows
         left = schedule.left(now_ns=now_ns)
-        return spare is None or not left or left < spare + self._delay_steps(schedule)
+        return spare is None or not left or left < spare + self._delay_steps()
 
     def _accept(self, message: bytes, now_ns: int) -> None:
         """Accept a chunk or an error of the policy."""
@@ -457,10 +474,17 @@ class RobotEnd(Endpoint):
             self._events.append(events.ChunkRefused(robot=self._robot, reason=str(refused)))
             self._since.fault = f"its chunk is refused: {refused}"
             return
-        self._delays_ns.append(delay_ns)
+        if program.answers_first:
+            self._delays.clear()  # the policy may have compiled before its first chunk
+        program.answers_first = program.newest < 0
+        steps = -(-delay_ns // schedule.step_ns)
+        if not self._options.plays_on:  # no row is executed while the program waits
+            steps = schedule.open_step(now_ns=now_ns) - asked.step
+        self._delays.append((delay_ns, steps))
         if call_number > program.newest:
             program.newest, program.made_ns = call_number, asked.began_ns
-            self._since = _SinceChunk()
+            first = self._exchange.number(OBSERVATION) + 1 if self._exchange else 0
+            self._since = _SinceChunk(first=first)
         if call and (call.number == call_number or call.is_first):
             self._answer(Kind.FRESH, now_ns)
 
@@ -486,7 +510,7 @@ class RobotEnd(Endpoint):
                 error = f"no action from the policy for {held_s:.2f} s"
             if not self._is_holding:
                 self._is_holding = True
-                why = self._why_no_row(call, since_ns, now_ns)
+                why = self._why_no_row(program, call, since_ns, now_ns)
                 self._events.append(events.Holding(robot=self._robot, reason=why))
         elif self._is_holding and not error:
             self._is_holding = False
@@ -508,19 +532,20 @@ class RobotEnd(Endpoint):
         else:
             self.send(FrameType.MESSAGE.value + message, program.peer, LINE)
 
-    def _why_no_row(self, call: _Call, since_ns: int, now_ns: int) -> str:
+    def _why_no_row(self, program: _Program, call: _Call, since_ns: int, now_ns: int) -> str:
         """Reason why no row remains since `since_ns`, as far as this end can tell."""
         since, silence_ns = self._since, now_ns - self._heard_ns
         if self._exchange is None:
             return "no session with `policy serve`"
         if since.fault:
             return since.fault
-        if since.sent <= 1 and call.began_ns > since_ns:
-            pause_s = (call.began_ns - since_ns) / SECOND_NS
+        pause_ns = call.began_ns - since_ns
+        if program.newest >= 0 and since.sent <= 1 and pause_ns > program.schedule.step_ns:
+            pause_s = pause_ns / SECOND_NS
             return f"the program made no call for {pause_s:.2f} s after its last row"
         if silence_ns >= SILENT_NS:
             return f"no datagram from `policy serve` for {silence_ns / SECOND_NS:.1f} s"
-        counts = f"{since.reported} of the last {since.sent} observations"
+        counts = f"{len(since.reported)} of the last {since.sent} observations"
         return f"by its reports {counts} have reached `policy serve`, but no chunk has arrived here"
 
     # -- time ----------------------------------------------------------------------------------
@@ -567,7 +592,7 @@ class RobotEnd(Endpoint):
             "answers": by_name({kind: self._counts[kind] for kind in KINDS}),
             "late_s_max": max(self._late_ns, 0) / SECOND_NS,
             "observations_refused": self._refused,
-            "delay_s": max(self._delays_ns, default=0) / SECOND_NS,
+            "delay_s": max(self._delays, default=(0, 0))[0] / SECOND_NS,
             "step_s": program.schedule.step_ns / SECOND_NS if program else None,
             "chunk_age_s": None if self._age_ns < 0 else self._age_ns / SECOND_NS,
             "rows_left": self._left,

@@ -8,6 +8,7 @@ during a pause, but its surroundings may have changed: a chunk is discarded if i
 executed more than `late_ns` after their planned time.
 """
 
+import math
 from copy import copy
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple
@@ -138,6 +139,13 @@ class Schedule:
         self._made = {each.generation: self._made[each.generation] for each in held}
         step = int(self._count)
         self._end = step + len(self._coming(step, ROWS_MAX + HELD_MAX)[0])
+
+    def open_step(self, *, now_ns: int) -> int:
+        """First step whose row a chunk that arrives now can change."""
+        step = self.advance(now_ns=now_ns)
+        if self._stands:
+            return step
+        return self._given if self._rows else math.ceil(self._count)
 
     def number(self, *, now_ns: int) -> int:
         """Number of the present step as the player counts steps; a chunk begins with this step."""

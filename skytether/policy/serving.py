@@ -114,8 +114,8 @@ class PolicyEnd(Endpoint):
         draw: returns an unpredictable 32-bit number, used as session number.
         patience_ns: longest time for a reply of the policy; then the connection is reopened [ns].
         gives_rows: whether the keys `delay_steps`, `coming` and `committed` are added to an
-            observation: the longest recent time from observation to chunk in control steps, the
-            rows that the robot will execute from the observation's step on, and the first
+            observation: the largest recent number of rows executed between observation and chunk,
+            the rows that the robot will execute from the observation's step on, and the first
             `delay_steps` of them, which are executed before the chunk arrives, see `committed`.
         rate_max: largest send rate to each robot [B/s].
         unpacker: makes the hook that decompresses the images of one observation, see
@@ -317,7 +317,7 @@ class PolicyEnd(Endpoint):
             message = values.pack([job.call, b"", error])
         if not error:  # after an error the robot may send the observation again
             robot.answered = job.call, message
-            if job.held:
+            if job.held and self._gives_rows:
                 with suppress(ValueRefused):  # the robot end refuses it too, and logs the reason
                     rows = rows_of(values.unpack(reply), job.held.key).astype(np.float64)
                     robot.under_way.add(job.held.step, Held(job.call, job.held.step, rows))
@@ -434,6 +434,6 @@ class PolicyEnd(Endpoint):
 
 def _is_valid(held: RobotRows) -> bool:
     key, step, acknowledged, rows = held
-    is_array = isinstance(rows, np.ndarray) and rows.ndim > 0
+    is_array = isinstance(rows, np.ndarray) and rows.ndim > 0 and len(rows) > 0
     kinds = type(key), type(step), type(acknowledged)
     return kinds == (str, int, int) and (rows is None or is_array)

@@ -1,6 +1,7 @@
 """Robot end and policy end in virtual time: each call is answered by its deadline."""
 
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.players import Clocked, Freshest, Queue
 from skytether.policy.robot import LINE, FrameType, RobotOptions
 from skytether.policy.schedule import Kind, Schedule
+from skytether.policy.serving import PolicyEnd
 from skytether.policy.virtual import ROBOT, SERVER, NoActionError
+from skytether.server.gate import PlainGate
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.wire.drop import ProtocolError
@@ -197,7 +200,9 @@ def test_other_rules_of_merging_play_every_row_once(player: Any) -> None:
 
 
 def test_the_policy_is_given_the_rows_that_the_robot_will_play() -> None:
-    lab = Lab(ramp, to_policy="constant(60ms)", to_robot="constant(60ms)", gives_rows=True)
+    moves_on = replace(OPTIONS, plays_on=True)
+    far = {"to_policy": "constant(60ms)", "to_robot": "constant(60ms)"}
+    lab = Lab(ramp, moves_on, gives_rows=True, **far)
     lab.connect()
     lab.infer(state(0.0))
     lab.sleep(0.04)
@@ -206,6 +211,42 @@ def test_the_policy_is_given_the_rows_that_the_robot_will_play() -> None:
     assert seen["delay_steps"] == 6
     assert seen["coming"][:, 0].tolist() == [2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]
     assert seen["committed"][:, 0].tolist() == [2.0, 3.0, 4.0, 5.0, 6.0, 7.0]
+
+
+def test_while_a_robot_waits_for_its_chunk_no_row_is_committed() -> None:
+    lab = Lab(ramp, to_policy="constant(60ms)", to_robot="constant(60ms)", gives_rows=True)
+    lab.connect()
+    for position in (0.0, 2.0, 4.0):
+        lab.infer(state(position))
+        lab.sleep(0.04)
+    assert lab.asked[-1]["delay_steps"] == 0
+    assert len(lab.asked[-1]["committed"]) == 0
+    assert lab.asked[-1]["coming"][0, 0] == 4.0
+
+
+def test_the_time_in_which_a_policy_compiles_does_not_count() -> None:
+    moves_on = replace(OPTIONS, plays_on=True)
+    lab = Lab(ramp, moves_on, gives_rows=True, thinking=20.0)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.thinking_ns = 40 * MS
+    for position in range(1, 4):
+        lab.sleep(0.02)
+        lab.infer(state(float(position)))
+        lab.sleep(0.06)
+    assert lab.asked[-1]["delay_steps"] == 2
+
+
+def test_a_policy_end_restarted_with_other_options_gives_rows() -> None:
+    lab = Lab(ramp)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.server = PolicyEnd(PlainGate(), boot_id=9, draw=lambda: 77, gives_rows=True)
+    for _ in range(60):
+        lab.sleep(0.1)
+        with suppress(NoActionError):
+            lab.infer(state(1.0))
+    assert "delay_steps" in lab.asked[-1]
 
 
 def test_images_and_their_bytes() -> None:
@@ -386,7 +427,8 @@ def test_committed_rows_are_executed_also_with_several_chunks_under_way() -> Non
 
 
 def test_chunks_under_way_to_the_previous_program_are_not_predicted() -> None:
-    lab = Lab(to_policy="constant(60ms)", to_robot="constant(60ms)", gives_rows=True)
+    far = {"to_policy": "constant(60ms)", "to_robot": "constant(60ms)"}
+    lab = Lab(ramp, replace(OPTIONS, plays_on=True), gives_rows=True, **far)
     lab.connect()
     lab.infer(state(0.0))
     lab.say(FrameType.MESSAGE.value + values.pack(state(1.0)))
@@ -404,6 +446,7 @@ def test_chunks_under_way_to_the_previous_program_are_not_predicted() -> None:
     [
         *(np.array(1.0), "rows", [1, 2], 3, ["actions", 0, 0, np.array(1.0)]),
         *(["actions", 0, 0, "rows"], ["actions", 0.5, 0, None], [3, 0, 0, None]),
+        ["actions", 0, 0, np.zeros((0, 2))],
     ],
 )
 def test_rows_that_a_robot_cannot_have_are_refused(coming: Any) -> None:

@@ -469,7 +469,7 @@ def holds_because(lab: Lab) -> list[str]:
 
 
 def long_ramp(seen: Any) -> Any:
-    return {"actions": seen["state"][0] + np.arange(40.0)[:, None]}
+    return {"actions": seen["state"][0] + np.arange(80.0)[:, None]}
 
 
 def broken_line(seen: Any) -> Any:
@@ -481,8 +481,8 @@ def broken_line(seen: Any) -> Any:
 @pytest.mark.parametrize(
     ("options", "cut", "pause_s", "reason"),
     [
-        ({}, True, 0.0, "no datagram from `policy serve` for 0.5 s"),
-        ({"policy": long_ramp}, True, 0.0, "no datagram from `policy serve` for 1.1 s"),
+        ({}, True, 0.0, "by its reports 0 of the last 2 observations have reached"),
+        ({"policy": long_ramp}, True, 0.0, "no datagram from `policy serve` for 1.9 s"),
         ({"policy": broken_line}, False, 0.0, "error of the policy: no memory"),
         ({"thinking": 0.14}, False, 3.0, "the program made no call for 3.00 s"),
     ],
@@ -493,7 +493,7 @@ def test_a_hold_says_why_no_row_remains(
     lab, position = flying(**options)
     lab.is_cut = cut
     lab.sleep(pause_s)
-    fly(lab, 12, position)
+    fly(lab, 20, position)
     (why, *_) = holds_because(lab)
     assert why.startswith(reason)
 
