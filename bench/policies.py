@@ -6,6 +6,7 @@ openpi's client alone uses TCP through netem's relay, which repeats a lost piece
 compared over the same networks with a blocking call that retransmits lost datagrams.
 """
 
+import argparse
 import asyncio
 import json
 import math
@@ -417,7 +418,9 @@ def _table(runs: Sequence[dict[str, Any]]) -> TextTable:
 
 
 def main() -> None:
-    quick = "--quick" in sys.argv[1:]
+    parser = argparse.ArgumentParser(prog="python -m bench.policies", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="few runs; nothing is written")
+    quick = parser.parse_args().quick
     result = measure(QUICK if quick else FULL)
     for title, table in tables(result).items():
         table.show(title)

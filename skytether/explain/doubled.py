@@ -35,7 +35,8 @@ from skytether.sim.flight import MIDNIGHT_NS, SERVER
 from skytether.sim.world import World
 
 FLOWN: list[Double] = []
-"""Recorded flight for the next vehicle `doubled`; global, as a scenario cannot contain arrays."""
+"""Recorded flight that the next vehicle of kind `doubled` repeats. It is a global variable, because
+a scenario cannot contain arrays."""
 
 
 def actions(double: Double, scenario: Scenario) -> Iterator[tuple[float, Callable[[World], None]]]:

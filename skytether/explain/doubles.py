@@ -190,7 +190,7 @@ def _causes(rows: Rows) -> Indices:
 
 
 def _arrivals(sender: Rows, receiver: Rows) -> dict[int, int]:
-    """Number of the receiver's row, by number of the sender's row, for packets that arrived."""
+    """Row at which each packet that arrived was received, by the row at which it was sent."""
     sent, found = defaultdict[tuple[int, int], list[int]](list), dict[int, int]()
     for number in np.flatnonzero(sender["happened"] == SENT).tolist():
         sent[_packet(sender[number])].append(number)

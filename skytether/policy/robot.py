@@ -171,7 +171,9 @@ class _Program:
 
 @dataclass(slots=True)
 class _SinceChunk:
-    """Events since the newest chunk, from which the reason for a hold follows."""
+    """Events since the newest chunk or, without a chunk, since the program connected, from which
+    the reason for a hold follows.
+    """
 
     sent: int = 0
     """Number of observations sent."""
@@ -364,6 +366,8 @@ class RobotEnd(Endpoint):
                 self._program = _Program(peer, schedule, intervals_ns)
                 self._call = None
                 self._asked.clear()  # their chunks are for the previous program
+                self._is_holding = False
+                self._forget_events()
                 self._events.append(events.ProgramConnected(robot=self._robot))
                 self._greet()
             case FrameType.CLOSED if self._program and self._program.peer == peer:
@@ -435,6 +439,11 @@ class RobotEnd(Endpoint):
         if not (self._waits or call.is_first) and schedule.left(now_ns=now_ns):
             self._answer(Kind.REST, now_ns)
 
+    def _forget_events(self) -> None:
+        """Begin to collect the events since a chunk, or since a program has connected."""
+        first = self._exchange.number(OBSERVATION) + 1 if self._exchange else 0
+        self._since = _SinceChunk(first=first)
+
     def _delay_steps(self) -> int:
         """Largest number of rows executed before a chunk could change them."""
         return max((steps for _, steps in self._delays), default=0)
@@ -483,8 +492,7 @@ class RobotEnd(Endpoint):
         self._delays.append((delay_ns, steps))
         if call_number > program.newest:
             program.newest, program.made_ns = call_number, asked.began_ns
-            first = self._exchange.number(OBSERVATION) + 1 if self._exchange else 0
-            self._since = _SinceChunk(first=first)
+            self._forget_events()
         if call and (call.number == call_number or call.is_first):
             self._answer(Kind.FRESH, now_ns)
 

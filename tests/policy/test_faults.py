@@ -504,3 +504,15 @@ def test_a_hold_because_of_a_slow_policy_says_what_has_arrived() -> None:
     fly(lab, 8, position)
     (why,) = holds_because(lab)
     assert why.startswith("by its reports 2 of the last 2 observations have reached")
+
+
+def test_a_new_program_does_not_get_the_reason_of_the_one_before() -> None:
+    lab, position = flying(policy=broken_line)
+    fly(lab, 6, position)
+    assert holds_because(lab)
+    lab.thinking_ns = None
+    lab.say(FrameType.OPENED.value, ("program", 2))
+    lab.say(FrameType.MESSAGE.value + values.pack(state(0.0)), ("program", 2))
+    lab.sleep(61.0)
+    (why,) = holds_because(lab)
+    assert "memory" not in why
