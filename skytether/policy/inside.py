@@ -120,7 +120,7 @@ class _FunctionLine:
                 if isinstance(reply, np.ndarray):
                     reply = {"actions": reply}
                 said = FrameType.MESSAGE.value + values.pack(reply)
-            except Exception:
+            except BaseException:  # SystemExit too must not end this thread
                 said = FrameType.ERROR.value + traceback.format_exc().encode()
             try:
                 loop.call_soon_threadsafe(self._hear, Datagram(said, peer, LINE))
@@ -255,7 +255,7 @@ class Robot:
         self._line: _CallLine | None = None
         self._on_event = on_event
         self._shell = Shell(self._end, None, [at], line=self._open)
-        self._is_connected, self._unread = False, 0
+        self._lock = threading.Lock()
         self._patience_s = max(deadline, options.begin_ns / SECOND_NS) + 5.0
 
     def _open(self, hear: Hear, _: object) -> _CallLine:
@@ -263,6 +263,9 @@ class Robot:
         return self._line
 
     def __enter__(self) -> Self:
+        assert self._line
+        self._line.answers = queue.SimpleQueue()
+        self._is_connected, self._unread = False, 0
         began: Future[None] = Future()
         self._thread = threading.Thread(target=self._drive, args=(began,), daemon=True)
         self._thread.start()
@@ -305,14 +308,15 @@ class Robot:
             ValueRefused: the observation has a value of an unsupported type, see `values.pack`.
         """
         content = values.pack(observation)
-        if not self._is_connected:
-            self.metadata = values.unpack(self._answer()[1:])
-            self._is_connected = True
-        self._say(FrameType.MESSAGE.value + content)
-        self._unread += 1
-        while self._unread:  # several answers if an earlier call was interrupted
-            answer = self._answer()
-            self._unread -= 1
+        with self._lock:
+            if not self._is_connected:
+                self.metadata = values.unpack(self._answer()[1:])
+                self._is_connected = True
+            self._say(FrameType.MESSAGE.value + content)
+            self._unread += 1
+            while self._unread:  # several answers if an earlier call was interrupted
+                answer = self._answer()
+                self._unread -= 1
         if answer[:1] == FrameType.ERROR:
             raise PolicyError(answer[1:].decode())
         return values.unpack(answer[1:])

@@ -7,8 +7,11 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from pathlib import Path
+from queue import SimpleQueue
+from threading import Barrier, BrokenBarrierError
 from types import SimpleNamespace
 from typing import Any
 from urllib.request import urlopen
@@ -24,6 +27,8 @@ from helpers import LOOPBACK, SKYTETHER, Idle, refused
 from policy_lab import messages, process, ramp
 from skytether.__main__ import main
 from skytether.policy import PolicyError, Robot, values
+from skytether.policy.inside import _FunctionLine
+from skytether.policy.robot import FrameType
 from skytether.shared.base.errors import ConfigError
 from skytether.shell.driving.driver import Shell
 
@@ -216,6 +221,53 @@ def test_an_answer_to_a_call_that_was_interrupted_is_not_that_of_the_next() -> N
     with pytest.raises(PolicyError):
         robot.infer({})
     robot._shell._close_sockets()
+
+
+def function_line(infer: Any) -> tuple[Any, "SimpleQueue[bytes]"]:
+    """Local connection to a function, and the queue of what it says."""
+    said: SimpleQueue[bytes] = SimpleQueue()
+    loop: Any = SimpleNamespace(call_soon_threadsafe=lambda hear, each: hear(each))
+    line = _FunctionLine(infer, {}, lambda each: said.put(each.payload))
+    threading.Thread(target=line._work, args=(loop,), daemon=True).start()
+    return line, said
+
+
+def test_a_policy_that_exits_is_an_error_and_is_called_again() -> None:
+    def infer(_: Any) -> Any:
+        raise SystemExit(3)
+
+    line, said = function_line(infer)
+    for _ in range(2):
+        line.send(FrameType.MESSAGE.value + values.pack({}), ("policy", 1))
+        assert b"SystemExit" in said.get(timeout=10)
+
+
+def test_calls_from_several_threads_are_made_one_after_the_other() -> None:
+    robot = Robot("127.0.0.1:9", actions="delta")
+    assert robot._line
+    answers, calls = robot._line.answers, Barrier(2)
+
+    def say(said: bytes) -> None:
+        with pytest.raises(BrokenBarrierError):
+            calls.wait(0.1)
+        answers.put(said)
+
+    robot._say = say  # type: ignore[method-assign]
+    robot._is_connected, robot._unread, robot._patience_s = True, 0, 0.5
+    with ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(robot.infer, range(2))) == [0, 1]
+    robot._shell._close_sockets()
+
+
+def test_a_robot_that_is_connected_again_gets_no_earlier_answer() -> None:
+    robot = Robot("127.0.0.1:9", actions="delta")
+    assert robot._line
+    for _ in range(2):
+        with robot:
+            assert robot._line.answers.empty()
+            assert not robot._is_connected
+            robot._line.answers.put(b"m")
+            robot._is_connected = True
 
 
 @pytest.mark.parametrize(
