@@ -124,7 +124,7 @@ class JoinOptions(EndOptions):
     """Whether the robot continues to execute rows during a call. Requires --step."""
     when: str = "always"
     """Observations that are sent: always sends each; needed(N) sends an observation only if fewer
-    than N rows will remain when its action chunk arrives."""
+    than N rows will remain when its action chunk arrives, or fewer than --rows remain."""
     merge: Literal["clock", "average", "drtc"] = "clock"
     """Rule for a step with rows in several chunks: clock, the row of the newest chunk; average,
     LeRobot's weighted average; drtc, DRTC's rule. clock counts steps by the clock; average and drtc

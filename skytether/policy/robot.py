@@ -54,8 +54,9 @@ SILENT_NS = ALIVE_NS + SECOND_NS // 2
 """Time without a datagram that counts as the reason for a hold [ns]."""
 AGAIN_NS = SECOND_NS
 """Time between repetitions of the first observation [ns]."""
-STEP_NS_FIRST = 50 * MILLISECOND_NS
-"""Assumed length of a control step before it is measured [ns]."""
+STEP_NS_FIRST = 200 * MILLISECOND_NS
+"""Assumed length of a control step before it is measured [ns]; a longer one counts as a pause until
+a third of the newest calls have measured it."""
 STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
 """Bounds of the measured step length [ns]: a pause of the program is not a long step."""
 MEASURED, ASKED_MAX = 9, 1024
@@ -117,8 +118,8 @@ class RobotOptions:
     plays_on: bool = False
     """Whether the robot continues to execute rows during a call."""
     spare_rows: int | None = None
-    """An observation is sent only if fewer rows than this will remain when its chunk arrives;
-    None: every observation is sent."""
+    """An observation is sent only if fewer rows than this will remain when its chunk arrives, or
+    fewer than `rows` remain; None: every observation is sent."""
     rate_max: float = RATE_MAX
     """Largest send rate [B/s]."""
     player: Callable[[], Player] = Clocked
@@ -449,9 +450,9 @@ class RobotEnd(Endpoint):
         return max((steps for _, steps in self._delays), default=0)
 
     def _is_needed(self, schedule: Schedule, now_ns: int) -> bool:
-        spare = self._options.spare_rows
+        spare, rows = self._options.spare_rows, self._options.rows
         left = schedule.left(now_ns=now_ns)
-        return spare is None or not left or left < spare + self._delay_steps()
+        return spare is None or left < max(spare + self._delay_steps(), rows)
 
     def _accept(self, message: bytes, now_ns: int) -> None:
         """Accept a chunk or an error of the policy."""

@@ -78,8 +78,12 @@ class Schedule:
         self._given = 0
         """First step without a row in the program's last answer; later chunks do not change it."""
         self._reply: Any = None
+        self._dtype: np.dtype[Any] = np.dtype(np.float64)
+        """Type that has all numbers of the received chunks."""
+        self._answered: tuple[int, list[Row]] = 0, []
+        """Step and rows of the program's newest answer with rows."""
         self._last: Row | None = None
-        """Last row that the program was given to execute."""
+        """Last row that the program has executed."""
         self._newest = -1
         """Number of the call that `_reply` answers."""
         self._first = 0
@@ -164,8 +168,8 @@ class Schedule:
             ValueRefused: the reply has no valid rows, its row shape has changed, or the chunk is
                 more than `late_ns` late.
         """
-        rows = rows_of(reply, self._key).astype(np.float64)
-        step = self.advance(now_ns=now_ns)
+        made = rows_of(reply, self._key)
+        rows, step = made.astype(np.float64), self.advance(now_ns=now_ns)
         if self._reply is not None:
             before = rows_of(self._reply, self._key).shape[1:]
             if before != rows.shape[1:]:
@@ -179,6 +183,10 @@ class Schedule:
             why = f"the robot has paused for {late_s:.1f} s since the chunk's observation"
             raise ValueRefused(f"{why}, expected at most the sum of deadline and hold")
         self._made[call] = stood_ns
+        if self._reply is None:
+            self._dtype = made.dtype
+        elif self._dtype != made.dtype:
+            self._dtype = np.result_type(self._dtype, made.dtype)
         self._player.accept(Held(call, first, rows), step)
         if call > self._newest:
             self._newest, self._reply, self._first = call, reply, first
@@ -211,9 +219,12 @@ class Schedule:
         step = self.advance(now_ns=now_ns)
         made = rows_of(self._reply, self._key)
         rows, last = self._coming(step, len(made))
+        first, before = self._answered
+        if step > first:
+            self._last = before[step - first - 1]
         if rows:
             given, last = min(len(rows), self._rows or len(rows)), rows[-1]
-            self._given, self.since_ns, self._last = step + given, None, rows[given - 1]
+            self._given, self.since_ns, self._answered = step + given, None, (step, rows)
         else:
             last = last if self._last is None else self._last
             kind = Kind.HOLD
@@ -221,7 +232,7 @@ class Schedule:
         if last is None:
             return Answer(kind, None, 0)
         fill = last if self._actions == "absolute" else np.zeros_like(last)
-        every = np.stack([*rows, *[fill] * (len(made) - len(rows))]).astype(made.dtype, copy=False)
+        every = np.stack([*rows, *[fill] * (len(made) - len(rows))]).astype(self._dtype, copy=False)
         cut = min(max(self._player.number(step) - self._first, 0), len(made) - 1)
         reply = _cut(self._reply, len(made), cut)
         reply[self._key] = every

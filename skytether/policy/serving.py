@@ -48,6 +48,8 @@ PATHS_MAX = 4
 """Largest number of addresses of a robot; the least recently used are discarded."""
 AGAIN_NS = SECOND_NS
 """Time after which a lost connection to the policy is reopened [ns]."""
+METADATA_BYTES_MAX = values.BYTES_MAX - 16
+"""Largest metadata of the policy [B]."""
 POLICY = "policy"
 """Name in the policy's peer address on the local socket: `(POLICY, connection number)`. The numbers
 are not reused, so a reply that arrives after its connection has ended is ignored."""
@@ -274,6 +276,10 @@ class PolicyEnd(Endpoint):
             return
         robot = self._robots[number]
         match said[:1]:
+            case FrameType.OPENED if len(said) - 1 > METADATA_BYTES_MAX:
+                reason = f"metadata of {len(said) - 1} B, expected at most {METADATA_BYTES_MAX}"
+                self._lose(number, robot, reason, now_ns)
+                return
             case FrameType.OPENED:
                 robot.is_open, robot.is_opening = True, False
                 self._metadata = said[1:]

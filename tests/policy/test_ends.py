@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from policy_lab import MS, OPTIONS, Lab, first_row, keyed, ramp, secured, state
-from skytether.policy import values
+from skytether.policy import events, values
 from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.players import Clocked, Freshest, Queue
 from skytether.policy.robot import LINE, FrameType, RobotOptions
@@ -399,6 +399,65 @@ def test_the_hold_action_is_the_last_row_that_was_executed() -> None:
     answer = schedule.answer(Kind.REST, now_ns=200 * MS)
     assert answer.kind is Kind.HOLD
     assert answer.reply["actions"][0, 0] == 5.0
+
+
+def test_the_hold_action_is_no_row_that_was_discarded_before_it_was_executed() -> None:
+    """The robot has executed 3 of 6 rows, then the call takes longer than `late_ns`."""
+    schedule = Schedule(Clocked(), "absolute", "actions", 20 * MS, None, SECOND_NS, 0)
+    schedule.accept(1, 0, 0.0, {"actions": np.arange(6.0)[:, None]}, now_ns=0)
+    schedule.answer(Kind.FRESH, now_ns=0)
+    schedule.stand(now_ns=60 * MS)
+    schedule.go(now_ns=2 * SECOND_NS)
+    answer = schedule.answer(Kind.REST, now_ns=2 * SECOND_NS)
+    assert answer.kind is Kind.HOLD
+    assert answer.reply["actions"].tolist() == [[2.0]] * 6
+
+
+def test_rows_of_a_slow_robot_remain_while_its_step_is_measured() -> None:
+    """Eight rows of 200 ms, and a policy that takes longer than the deadline."""
+    policy = {"actions": np.arange(16.0)[:, None]}
+    lab = Lab(lambda _: policy, RobotOptions("absolute", 150 * MS, rows=8), thinking=0.3)
+    lab.connect()
+    lab.infer(state(0.0))
+    for _ in range(5):
+        lab.sleep(1.6)
+        assert first_row(lab.infer(state(0.0))) == 8.0
+
+
+def test_with_needed_a_program_gets_the_rows_that_it_executes() -> None:
+    """Chunks of 8 rows, of which 5 are executed: 3 rows and two hold actions are not enough."""
+    lab = Lab(
+        lambda seen: {"actions": ramp(seen)["actions"][:8]},
+        RobotOptions("absolute", 150 * MS, rows=5, spare_rows=2),
+    )
+    lab.connect()
+    for position in (0.0, 5.0, 10.0, 15.0):
+        rows = lab.infer(state(position))["actions"][:5, 0]
+        assert rows.tolist() == [position + row for row in range(5)]
+        lab.sleep(0.1)
+
+
+def test_rows_keep_their_fractions_when_the_policy_returns_whole_numbers_next() -> None:
+    chunks = iter([np.arange(6)[:, None] + 0.5, np.array([[7], [8]])])
+    lab = Lab(lambda _: {"actions": next(chunks)}, RobotOptions("absolute", 150 * MS))
+    lab.connect()
+    got = []
+    for _ in range(4):
+        got.append(first_row(lab.infer(state(0.0))))
+        lab.sleep(0.02)
+    assert got == [0.5, 7.0, 8.0, 3.5]
+
+
+def test_metadata_that_are_too_large_are_refused_by_name() -> None:
+    lab = Lab()
+    lab.robot.wake(now_ns=0)
+    lab.run(MS)
+    metadata = values.pack("x" * values.BYTES_MAX)
+    lab.policy_says(FrameType.OPENED.value + metadata, ("policy", 1))
+    (reason,) = [
+        each.reason for each in lab.server.events() if isinstance(each, events.UpstreamLost)
+    ]
+    assert f"metadata of {len(metadata)} B" in reason
 
 
 def test_committed_rows_are_executed_also_with_several_chunks_under_way() -> None:
