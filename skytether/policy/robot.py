@@ -55,8 +55,8 @@ SILENT_NS = ALIVE_NS + SECOND_NS // 2
 AGAIN_NS = SECOND_NS
 """Time between repetitions of the first observation [ns]."""
 STEP_NS_FIRST = 200 * MILLISECOND_NS
-"""Assumed length of a control step before it is measured [ns]; a longer one counts as a pause until
-a third of the newest calls have measured it."""
+"""Assumed length of a control step before it is measured [ns]. What a step takes longer counts as a
+pause until three intervals have been measured."""
 STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
 """Bounds of the measured step length [ns]: a pause of the program is not a long step."""
 MEASURED, ASKED_MAX = 9, 1024
