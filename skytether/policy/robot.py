@@ -554,6 +554,8 @@ class RobotEnd(Endpoint):
             return f"the program made no call for {pause_s:.2f} s after its last row"
         if silence_ns >= SILENT_NS:
             return f"no datagram from `policy serve` for {silence_ns / SECOND_NS:.1f} s"
+        if not since.sent:
+            return "the newest chunk has arrived after the time of its last row"
         counts = f"{len(since.reported)} of the last {since.sent} observations"
         return f"by its reports {counts} have reached `policy serve`, but no chunk has arrived here"
 

@@ -46,6 +46,8 @@ PATH_NS = 3 * SECOND_NS
 """Time without a datagram from an address after which no datagram is sent to the address [ns]."""
 PATHS_MAX = 4
 """Largest number of addresses of a robot; the least recently used are discarded."""
+REPLACED_MAX = 16
+"""Largest number of earlier runs that are remembered of a robot."""
 AGAIN_NS = SECOND_NS
 """Time after which a lost connection to the policy is reopened [ns]."""
 METADATA_BYTES_MAX = values.BYTES_MAX - 16
@@ -93,6 +95,8 @@ class _Robot:
     """Time at which a closed connection is reopened [ns]."""
     is_opening: bool = False
     has_metadata: bool = False
+    replaced: tuple[int, ...] = ()
+    """`boot_id` of the newest earlier runs whose session this one ended."""
 
     @property
     def session(self) -> int:
@@ -218,11 +222,12 @@ class PolicyEnd(Endpoint):
         refusal = Refusal.ACCEPTED
         if present is None and len(self._robots) >= ROBOTS_MAX:
             refusal = Refusal.FULL
-        elif present and call.vehicle is None and hello.boot_id != present.boot_id:
-            # Without keys anybody may send this number; the robot with a session keeps it.
-            is_silent = now_ns - present.heard_ns >= PATH_NS
+        elif present and hello.boot_id != present.boot_id and now_ns - present.heard_ns < PATH_NS:
+            # Without keys anybody may send this number; the robot with a session keeps it. With
+            # keys the newest run gets it, and the one before must not take it back.
             is_here = (datagram.socket, datagram.peer) in present.paths
-            refusal = Refusal.ACCEPTED if is_silent or is_here else Refusal.TAKEN
+            is_taken = not is_here if call.vehicle is None else hello.boot_id in present.replaced
+            refusal = Refusal.TAKEN if is_taken else Refusal.ACCEPTED
         if refusal is Refusal.ACCEPTED:
             of_run = (present, self._welcomed.get(number))
             robot = next((each for each in of_run if each and each.boot_id == hello.boot_id), None)
@@ -253,6 +258,7 @@ class PolicyEnd(Endpoint):
         before, robot = self._robots.get(number), self._welcomed.pop(number)
         if before:
             self._close(before)
+            robot.replaced = (*before.replaced, before.boot_id)[-REPLACED_MAX:]
         self._robots[number] = robot
         robot.heard_ns = now_ns
         self._open(number, robot, now_ns)

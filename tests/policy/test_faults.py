@@ -158,6 +158,32 @@ def test_a_hello_of_an_earlier_run_ends_no_session() -> None:
     assert got == [20.0, 25.0, 30.0]
 
 
+def test_of_two_robots_with_one_key_the_newest_run_keeps_the_number() -> None:
+    """The earlier run gets the number again after the newer one has been silent for 3 s."""
+    lab, _ = flying(secured)
+    link = SecureLink(keyed(), entropy=np.random.default_rng(9).bytes)
+    newer, there = RobotEnd(1, {0: SERVER}, link, OPTIONS, boot_id=55), ("203.0.113.9", 9)
+    server = Around(lab.server)
+
+    def leaves(each: Datagram) -> bool:
+        if each.peer == there:
+            newer.receive(Datagram(each.payload, SERVER), now_ns=lab.now_ns)
+        return each.peer != there
+
+    server.leaves = leaves
+    lab.server = server  # type: ignore[assignment]
+    for _ in range(80):
+        newer.wake(now_ns=lab.now_ns)
+        for each in newer.outbox():
+            lab.server.receive(Datagram(each.payload, there), now_ns=lab.now_ns)
+        lab.sleep(0.1)
+    refused = [each for each in lab.robot.events() if isinstance(each, events.JoinRefused)]
+    assert "taken" in str(refused[-1])
+    assert not any(isinstance(each, events.PolicySilent) for each in newer.events())
+    lab.sleep(5)
+    assert first_row(lab.infer(state(7.0))) == 7.0
+
+
 # -- policy -------------------------------------------------------------------------------------
 
 
@@ -504,6 +530,17 @@ def test_a_hold_because_of_a_slow_policy_says_what_has_arrived() -> None:
     fly(lab, 8, position)
     (why,) = holds_because(lab)
     assert why.startswith("by its reports 2 of the last 2 observations have reached")
+
+
+def test_a_hold_because_chunks_are_later_than_their_rows_says_so() -> None:
+    """Chunks of 200 ms arrive after 300 ms."""
+    far = {"to_policy": "constant(150ms)", "to_robot": "constant(150ms)"}
+    lab = Lab(options=RobotOptions("absolute", 150 * MS, rows=5), **far)
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.sleep(0.1)
+    fly(lab, 10, 5.0)
+    assert "the newest chunk has arrived after the time of its last row" in holds_because(lab)
 
 
 def test_a_new_program_does_not_get_the_reason_of_the_one_before() -> None:
