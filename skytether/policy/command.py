@@ -287,7 +287,7 @@ def _robot_options(options: JoinOptions) -> RobotOptions:
     return RobotOptions(
         options.actions,
         _time_ns("--deadline", options.deadline),
-        hold_ns=_time_ns("--hold", options.hold),
+        hold_ns=_time_ns("--hold", options.hold, 0),
         begin_ns=_time_ns("--begin", options.begin),
         key=options.actions_key,
         step_ns=None if options.step is None else _time_ns("--step", options.step),
@@ -346,10 +346,10 @@ def _drive(
             command.write(options.json, msgspec.json.encode(last.figures))
 
 
-def _time_ns(flag: str, text: str) -> int:
+def _time_ns(flag: str, text: str, least_ns: int = 1) -> int:
     """Parse the time given to a flag [ns]; a number without unit is in seconds."""
     expected = "a time such as 150ms or 1.5s, at most an hour"
-    return round(_quantity(flag, text, UNITS_NS, (1, 3600 * SECOND_NS), expected))
+    return round(_quantity(flag, text, UNITS_NS, (least_ns, 3600 * SECOND_NS), expected))
 
 
 def _rate(text: str | None) -> float:

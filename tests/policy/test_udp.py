@@ -27,6 +27,7 @@ from helpers import LOOPBACK, SKYTETHER, Idle, refused
 from policy_lab import messages, process, ramp
 from skytether.__main__ import main
 from skytether.policy import PolicyError, Robot, values
+from skytether.policy.command import JoinOptions, _robot_options
 from skytether.policy.inside import _FunctionLine
 from skytether.policy.robot import FrameType
 from skytether.shared.base.errors import ConfigError
@@ -193,6 +194,10 @@ def test_what_is_wrong_is_named(
     argv: list[str], says: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     assert says in refused(["policy", *argv], capfd)
+
+
+def test_without_a_hold_time_calls_get_an_error_at_once() -> None:
+    assert _robot_options(JoinOptions(actions="delta", hold="0")).hold_ns == 0
 
 
 def test_other_machines_need_keys_in_python_too() -> None:
