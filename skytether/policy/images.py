@@ -108,6 +108,13 @@ def _mapped(value: Any, key: str, change: Callable[[str, Any], Any]) -> Any:
     if isinstance(value, dict):
         inner = f"{key}/" if key else ""
         return {name: _mapped(each, f"{inner}{name}", change) for name, each in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, list) and not _is_pixels(value):
         return [_mapped(each, f"{key}/{i}", change) for i, each in enumerate(value)]
     return change(key, value)
+
+
+def _is_pixels(value: list[Any]) -> bool:
+    """Whether a list is rows of pixels, which would take a second to copy."""
+    row = value[0] if value else None
+    pixel = row[0] if isinstance(row, list) and row else None
+    return isinstance(pixel, list)

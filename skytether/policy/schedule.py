@@ -9,6 +9,7 @@ executed more than `late_ns` after their planned time.
 """
 
 import math
+from contextlib import suppress
 from copy import copy
 from enum import StrEnum
 from typing import Any, Literal, NamedTuple
@@ -246,6 +247,9 @@ def rows_of(reply: Any, key: str) -> NDArray[Any]:
         ValueRefused: the reply has no rows or more than ROWS_MAX, or a number is not finite.
     """
     rows = reply.get(key) if isinstance(reply, dict) else None
+    if isinstance(rows, list):  # as some policy servers send them
+        with suppress(ValueError):  # rows of different lengths
+            rows = np.array(rows)
     if not isinstance(rows, np.ndarray) or not rows.ndim or not rows.size or len(rows) > ROWS_MAX:
         shape = getattr(rows, "shape", None)
         what = f"an array of shape {shape}" if shape is not None else type(rows).__name__

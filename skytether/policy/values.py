@@ -1,8 +1,9 @@
 """Serialization of observations and actions in openpi's format: msgpack with numpy arrays.
 
 An array is a map with the byte-string keys `__ndarray__`, `data`, `dtype` and `shape`; a numpy
-scalar is a map with `__npgeneric__`, `data` and `dtype`. Only numbers and booleans are accepted as
-elements: nothing is unpickled, and the shape of an array must match the size of its data.
+scalar is a map with `__npgeneric__`, `data` and `dtype`. Only numbers, booleans and texts are
+accepted as elements: nothing is unpickled, and the shape of an array must match the size of its
+data.
 """
 
 import re
@@ -20,7 +21,7 @@ BYTES_MAX = 4_000_000
 MADE_BYTES_MAX = 64_000_000
 """Largest serialized value before compression, and largest sum of its decompressed images [B]."""
 AXES_MAX = 8
-_DTYPE = re.compile(r"[<>|=]?[biuf][1248]")
+_DTYPE = re.compile(r"[<>|=]?([biuf][1248]|[US][1-9]\d{0,5})")
 
 
 class ValueRefused(ValueError):
@@ -73,7 +74,7 @@ def unpack(
 
 def _described(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic) and not _DTYPE.fullmatch(value.dtype.str):
-        raise ValueRefused(f"got an array of {value.dtype}, expected numbers")
+        raise ValueRefused(f"got an array of {value.dtype}, expected numbers or texts")
     if isinstance(value, np.ndarray):
         return {
             ARRAY: True,
@@ -88,7 +89,7 @@ def _described(value: Any) -> Any:
 
 def _dtype(given: Any) -> "np.dtype[Any]":
     if not isinstance(given, str) or not _DTYPE.fullmatch(given):
-        raise ValueRefused(f"got an array of {given!r:.40}, expected numbers")
+        raise ValueRefused(f"got an array of {given!r:.40}, expected numbers or texts")
     return np.dtype(given)
 
 

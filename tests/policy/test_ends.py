@@ -138,6 +138,8 @@ def test_an_error_of_the_policy_leaves_the_rest_then_an_error() -> None:
         {"actions": np.array([[np.nan]])},
         {"actions": np.zeros((2000, 1))},
         {"actions": "run"},
+        {"actions": [[1.0], [2.0, 3.0]]},
+        {"actions": []},
         [1, 2],
     ],
 )
@@ -146,6 +148,15 @@ def test_a_reply_without_rows_is_none(reply: Any) -> None:
     lab.connect()
     with pytest.raises(NoActionError):
         lab.infer(state(0.0))
+
+
+def test_rows_may_be_lists() -> None:
+    lab = Lab(lambda seen: {"actions": ramp(seen)["actions"].tolist()})
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.sleep(0.1)
+    lab.is_cut = True
+    assert lab.infer(state(5.0))["actions"][:5].tolist() == [[row] for row in range(5, 10)]
 
 
 def test_rows_of_another_shape_than_before_are_refused() -> None:

@@ -16,7 +16,7 @@ from skytether.policy import values
 from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.values import ValueRefused
 
-KINDS = st.sampled_from(["<f4", "<f8", "|u1", "<i8", "|b1", ">i2"]).map(np.dtype)
+KINDS = st.sampled_from(["<f4", "<f8", "|u1", "<i8", "|b1", ">i2", "<U3", "|S2"]).map(np.dtype)
 LEAVES = (
     st.integers(-(2**63), 2**64 - 1)
     | st.floats(allow_nan=False)
@@ -50,6 +50,16 @@ def test_a_value_is_what_openpis_own_client_would_send(tree: object) -> None:
     assert same(values.unpack(packed), tree)
 
 
+def test_arrays_arrive_as_openpis_own_client_would_send_them() -> None:
+    """In any memory layout, and a prompt as an array, which openpi's policies take too."""
+    square = np.arange(12.0).reshape(3, 4)
+    prompt = np.asarray("pick up the fork")
+    for array in (prompt, square[:, ::2], np.asfortranarray(square), square[::-1], np.array(1.5)):
+        packed = values.pack({"key": array})
+        assert packed == msgpack_numpy.packb({"key": array})
+        assert same(values.unpack(packed)["key"], array)
+
+
 @given(st.binary(max_size=200))
 def test_bytes_are_a_value_or_refused(data: bytes) -> None:
     with suppress(ValueRefused):
@@ -63,7 +73,9 @@ ARRAY = {b"__ndarray__": True, b"data": bytes(8), b"dtype": "<f8", b"shape": [1]
     "change",
     [
         {b"dtype": "|O"},
-        {b"dtype": "<U2"},
+        {b"dtype": "<U0", b"data": b""},
+        {b"dtype": "<U3"},
+        {b"dtype": "<M8[ns]"},
         {b"dtype": 3},
         {b"shape": [2]},
         {b"shape": [-1]},
@@ -111,6 +123,7 @@ def test_images_are_resized_as_openpi_does_and_arrive_in_their_axes(*, first: bo
 
 def test_a_raw_image_and_what_is_no_image_are_unchanged() -> None:
     observation = {"a": picture(40, 40), "mask": np.zeros((40, 40, 2), np.uint8), "n": 3}
+    observation["list"] = picture(40, 40).tolist()
     came = values.unpack(values.pack(Compressor(raw=["a"])(observation)), Unpacker())
     assert same(came, observation)
 
