@@ -28,6 +28,14 @@ class RobotSilent(RobotEvent):
     silence_s: float
 
 
+class NoWelcome(RobotEvent):
+    sentence = (
+        "robot {robot}: no reply from `policy serve` at {peers}; check that it runs, that UDP "
+        "reaches it, and that both ends have the same keys"
+    )
+    peers: str
+
+
 class JoinRefused(RobotEvent):
     sentence = "robot {robot}: refused by `policy serve`: {reason}"
     reason: str

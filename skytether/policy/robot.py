@@ -10,6 +10,8 @@ protocol, or `Robot.infer`. A call is an observation. It is answered
   program must stop the robot.
 
 The first call of a program waits for its chunk for up to `begin_ns`, since the robot has not moved.
+So does a call after the program has executed all rows and then paused for more than `hold_ns`, as
+between two episodes.
 
 A frame of the local connection begins with a byte of `FrameType`.
 """
@@ -64,6 +66,12 @@ MEASURED, ASKED_MAX = 9, 1024
 whose chunks are accepted."""
 ROWS_SENT = 64
 """Largest number of next rows that are sent with an observation."""
+HELLOS = 4
+"""Number of unanswered HELLOs after which the log says so."""
+REFUSALS = {
+    Refusal.TAKEN: "another robot end has this number; each robot needs its own --id",
+    Refusal.FULL: "it has as many robots as it can serve",
+}
 KINDS = (Kind.FRESH, Kind.REST, Kind.HOLD, Kind.ERROR)
 
 
@@ -107,7 +115,7 @@ class RobotOptions:
     hold_ns: int = SECOND_NS
     """Longest time for which calls are answered with the hold action [ns]."""
     begin_ns: int = 60 * SECOND_NS
-    """Longest time from the first call to its answer [ns]."""
+    """Longest time to the answer of the first call, and of the first call after a pause [ns]."""
     key: str = "actions"
     """Key of the actions in the policy's reply."""
     step_ns: int | None = None
@@ -131,6 +139,7 @@ class _Call:
     number: int
     began_ns: int
     is_first: bool
+    """Whether it is the first call of the program, or of an episode."""
     message: bytes
     """Serialized observation; empty if it is not sent."""
     again_ns: int
@@ -219,6 +228,8 @@ class RobotEnd(Endpoint):
         before the first."""
         self._hello_ns: int | None = 0
         """Time of the next HELLO [ns]; None during a session."""
+        self._hellos = 0
+        """Number of HELLOs without an answer."""
         self._heard_ns = self._sent_ns = self._alive_ns = 0
         self._metadata: bytes | None = None
         self._has_metadata = False
@@ -289,11 +300,11 @@ class RobotEnd(Endpoint):
         if welcome.robot != self._robot or welcome.boot_id != self._boot_id:
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         if welcome.refusal:
-            reason = str(Refusal(welcome.refusal))
+            reason = REFUSALS.get(Refusal(welcome.refusal), "unknown")
             self._events.append(events.JoinRefused(robot=self._robot, reason=reason))
             return
         self._link.adopt(now_ns=now_ns)
-        self._heard_ns, self._hello_ns = now_ns, None
+        self._heard_ns, self._hello_ns, self._hellos = now_ns, None, 0
         session = welcome.session, welcome.server_boot_id
         if self._session == session:
             return
@@ -337,6 +348,10 @@ class RobotEnd(Endpoint):
             self._hello_ns = now_ns + self._link.hello_ns
             hello = encode(Hello(self._robot, self._boot_id))
             self._send_on_all(self._link.hello(hello, now_ns=now_ns))
+            self._hellos += 1
+            if self._hellos == HELLOS:
+                peers = ", ".join(address_text(*each) for each in self._servers.values())
+                self._events.append(events.NoWelcome(robot=self._robot, peers=peers))
         for answer in self._link.outbox():
             self._send_on_all(answer)
         if self._exchange is None:
@@ -395,12 +410,11 @@ class RobotEnd(Endpoint):
             step_ns = measured_ns // options.rows
             schedule.step_ns = min(max(step_ns, STEP_NS_LEAST), STEP_NS_MOST)
         self._calls += 1
-        is_first, again_ns = program.newest < 0, now_ns + AGAIN_NS
-        call = _Call(self._calls, now_ns, is_first, b"", again_ns)
-        self._call = call
         if not options.plays_on:
             schedule.stand(now_ns=now_ns)
         number = schedule.number(now_ns=now_ns)
+        is_first = program.newest < 0 or self._has_paused(program, now_ns)
+        self._call = call = _Call(self._calls, now_ns, is_first, b"", now_ns + AGAIN_NS)
         if not self._is_needed(schedule, now_ns):
             self._answer(Kind.REST, now_ns)
             return
@@ -444,6 +458,13 @@ class RobotEnd(Endpoint):
         """Begin to collect the events since a chunk, or since a program has connected."""
         first = self._exchange.number(OBSERVATION) + 1 if self._exchange else 0
         self._since = _SinceChunk(first=first)
+
+    def _has_paused(self, program: _Program, now_ns: int) -> bool:
+        """Whether the program has made no call since its last row, for longer than `hold_ns`."""
+        ended_ns, answered_ns = program.schedule.since_ns, program.answered_ns
+        if ended_ns is None or answered_ns is None or answered_ns > ended_ns:
+            return False
+        return now_ns - ended_ns > self._options.hold_ns
 
     def _delay_steps(self) -> int:
         """Largest number of rows executed before a chunk could change them."""
@@ -494,7 +515,7 @@ class RobotEnd(Endpoint):
         if call_number > program.newest:
             program.newest, program.made_ns = call_number, asked.began_ns
             self._forget_events()
-        if call and (call.number == call_number or call.is_first):
+        if call and call.number == call_number:
             self._answer(Kind.FRESH, now_ns)
 
     def _answer(self, kind: Kind, now_ns: int, error: str = "") -> None:
@@ -515,11 +536,11 @@ class RobotEnd(Endpoint):
             except Exception as refused:  # such as a reply nested too deeply; the call is answered
                 error = f"the policy's reply cannot be sent: {refused}"
         if kind is Kind.HOLD and not error:
+            why = self._why_no_row(program, call, since_ns, now_ns)
             if reply is None or now_ns - since_ns > self._options.hold_ns:
-                error = f"no action from the policy for {held_s:.2f} s"
+                error = f"no action from the policy for {held_s:.2f} s: {why}"
             if not self._is_holding:
                 self._is_holding = True
-                why = self._why_no_row(program, call, since_ns, now_ns)
                 self._events.append(events.Holding(robot=self._robot, reason=why))
         elif self._is_holding and not error:
             self._is_holding = False

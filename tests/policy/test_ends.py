@@ -374,7 +374,7 @@ def test_without_keys_a_second_robot_with_the_same_number_is_refused() -> None:
         lab.server.receive(Datagram(payload, ("203.0.113.9", 9), 0), now_ns=lab.now_ns)
     answer = lab.server.outbox()[-1]
     other.receive(Datagram(answer.payload, SERVER, 0), now_ns=lab.now_ns)
-    assert "taken" in str(other.events()[-1])
+    assert "--id" in str(other.events()[-1])
 
 
 # -- what a review found -----------------------------------------------------------------------

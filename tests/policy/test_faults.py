@@ -1,5 +1,6 @@
 """Answers to the robot program under faults, as in the table of docs/policy.md."""
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -353,11 +354,28 @@ def test_of_two_programs_the_newest_is_the_robots() -> None:
 
 
 def test_a_program_that_pauses_plays_nothing_old_and_its_pause_is_no_step() -> None:
-    lab, position = flying(options=RobotOptions("absolute", 150 * MS, rows=5))
+    options = RobotOptions("absolute", 150 * MS, rows=5, begin_ns=2 * SECOND_NS)
+    lab, position = flying(options=options)
     lab.is_cut = True
     lab.sleep(60)
-    assert fly(lab, 1, position)[0] in ([24.0], [None])
+    began_ns = lab.now_ns
+    with pytest.raises(NoActionError):
+        lab.infer(state(position))
+    assert lab.now_ns - began_ns == options.begin_ns
+    assert fly(lab, 1, position)[0] == [None]
     assert lab.robot.figures()["step_s"] <= 1.0
+
+
+@pytest.mark.parametrize(("pause_s", "waits"), [(0.5, False), (1.3, True), (60.0, True)])
+def test_the_first_call_of_an_episode_waits_for_its_chunk(pause_s: float, *, waits: bool) -> None:
+    """Otherwise, with a policy slower than the deadline, each episode would begin with an error."""
+    lab, _ = flying(thinking=0.3)
+    lab.sleep(pause_s)
+    with suppress(NoActionError):
+        assert (first_row(lab.infer(state(500.0))) == 500.0) == waits
+    assert lab.robot.figures()["answers"]["error"] == 0
+    lab.sleep(0.1)
+    fly(lab, 3, 505.0)
 
 
 # -- network -----------------------------------------------------------------------------------
@@ -510,7 +528,7 @@ def broken_line(seen: Any) -> Any:
         ({}, True, 0.0, "by its reports 0 of the last 2 observations have reached"),
         ({"policy": long_ramp}, True, 0.0, "no datagram from `policy serve` for 1.9 s"),
         ({"policy": broken_line}, False, 0.0, "error of the policy: no memory"),
-        ({"thinking": 0.14}, False, 3.0, "the program made no call for 3.00 s"),
+        ({}, True, 0.9, "the program made no call for 0.80 s"),
     ],
 )
 def test_a_hold_says_why_no_row_remains(
@@ -522,6 +540,28 @@ def test_a_hold_says_why_no_row_remains(
     fly(lab, 20, position)
     (why, *_) = holds_because(lab)
     assert why.startswith(reason)
+
+
+def test_an_error_says_why_no_row_remains() -> None:
+    lab, _ = flying(policy=broken_line)
+    for _ in range(10):
+        with suppress(NoActionError):
+            lab.infer(state(30.0))
+        lab.sleep(0.1)
+    with pytest.raises(NoActionError, match="error of the policy: no memory"):
+        lab.infer(state(30.0))
+
+
+def test_a_policy_end_that_does_not_reply_is_logged_once() -> None:
+    lab = Lab(ramp)
+    lab.is_cut = True
+    lab.say(FrameType.OPENED.value)
+    lab.sleep(60)
+    (said,) = (str(each) for each in lab.robot.events() if isinstance(each, events.NoWelcome))
+    assert SERVER[0] in said
+    lab.is_cut = False
+    lab.sleep(5)
+    assert first_row(lab.infer(state(1.0))) == 1.0
 
 
 def test_a_hold_because_of_a_slow_policy_says_what_has_arrived() -> None:
