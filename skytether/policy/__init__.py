@@ -1,7 +1,7 @@
 """A policy on another machine than its robot: each call is answered by its deadline.
 
     skytether policy serve --upstream ws://127.0.0.1:8000 --bind 0.0.0.0:47010 --keys robot.keys
-    skytether policy join gpu:47010 --listen 127.0.0.1:8000 --actions absolute --keys robot.keys
+    skytether policy join gpu:47010 --actions absolute --rows 10 --keys robot.keys
 
     skytether.policy.serve(infer, bind="0.0.0.0:47010", keys="robot.keys")
     with skytether.policy.Robot("gpu:47010", actions="absolute", keys="robot.keys") as robot:

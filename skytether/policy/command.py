@@ -42,7 +42,7 @@ PLAYERS: dict[str, Callable[[], Player]] = {
     "average": partial(Queue, "average"),
     "drtc": Freshest,
 }
-UNITS_NS = {"": 1e9, "us": 1e3, "ms": 1e6, "s": 1e9}
+UNITS_NS = {"us": 1e3, "ms": 1e6, "s": 1e9}
 RATES = {"kbit": 125.0, "mbit": 125e3, "gbit": 125e6}
 
 ABOUT = """usage: skytether policy serve|join ...
@@ -54,7 +54,7 @@ change.
     skytether policy serve --upstream ws://127.0.0.1:8000 --bind 0.0.0.0:47010
         --keys FILE
     skytether policy join gpu:47010 --listen 127.0.0.1:8000 --actions absolute
-        --keys FILE
+        --rows 10 --keys FILE
 
 `skytether policy serve --help` and `skytether policy join --help` list their
 options."""
@@ -119,7 +119,7 @@ class JoinOptions(EndOptions):
     measured time from an answer to the next call, divided by --rows."""
     rows: Annotated[int, Argument(metavar="N")] = 1
     """Number of rows that the program executes of each answer: `action_horizon` of openpi's
-    ActionChunkBroker, or 1 without one."""
+    ActionChunkBroker. With a wrong number, rows are repeated or skipped when a chunk is late."""
     plays_on: bool = False
     """Whether the robot continues to execute rows during a call. Requires --step."""
     when: str = "always"
@@ -347,7 +347,7 @@ def _drive(
 
 
 def _time_ns(flag: str, text: str, least_ns: int = 1) -> int:
-    """Parse the time given to a flag [ns]; a number without unit is in seconds."""
+    """Parse the time given to a flag, with its unit [ns]: 150 instead of 150ms is refused."""
     expected = "a time such as 150ms or 1.5s, at most an hour"
     return round(_quantity(flag, text, UNITS_NS, (least_ns, 3600 * SECOND_NS), expected))
 

@@ -42,7 +42,8 @@ class JoinRefused(RobotEvent):
 
 
 class ProgramConnected(RobotEvent):
-    sentence = "robot {robot}: program connected"
+    sentence = "robot {robot}: program connected; counted as executed: {counts}"
+    counts: str
 
 
 class ProgramGone(RobotEvent):

@@ -384,7 +384,10 @@ class RobotEnd(Endpoint):
                 self._asked.clear()  # their chunks are for the previous program
                 self._is_holding = False
                 self._forget_events()
-                self._events.append(events.ProgramConnected(robot=self._robot))
+                counts = f"{rows} row(s) of each answer, see --rows"
+                if rows is None:
+                    counts = f"a row each {step_ns / MILLISECOND_NS:g} ms"
+                self._events.append(events.ProgramConnected(robot=self._robot, counts=counts))
                 self._greet()
             case FrameType.CLOSED if self._program and self._program.peer == peer:
                 self._program = self._call = None

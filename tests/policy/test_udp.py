@@ -179,7 +179,7 @@ def test_a_robot_in_python_with_a_policy_in_python(tmp_path: Path) -> None:
         (["join", "127.0.0.1:1"], "--actions: got nothing, expected absolute or delta"),
         (["join", "--actions", "delta"], "expected either HOST:PORT or --path"),
         (["join", "192.0.2.1:1", "--actions", "delta"], "--keys"),
-        (["join", "127.0.0.1:1", "--actions", "delta", "--deadline", "soon"], "--deadline"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--deadline", "150"], "150ms"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "4"], "4mbit"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "90kbit"], "100kbit"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--when", "never"], "needed(2)"),
