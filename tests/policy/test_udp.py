@@ -2,7 +2,9 @@
 
 import asyncio
 import json
+import re
 import socket
+import subprocess
 import sys
 import threading
 import time
@@ -23,7 +25,7 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from websockets.asyncio.server import ServerConnection, serve
 from websockets.exceptions import ConnectionClosed
 
-from helpers import LOOPBACK, SKYTETHER, Idle, refused
+from helpers import LOOPBACK, SKYTETHER, Idle, ran, refused
 from policy_lab import messages, process, ramp
 from skytether.__main__ import main
 from skytether.policy import PolicyError, Robot, values
@@ -169,6 +171,32 @@ def test_a_robot_in_python_with_a_policy_in_python(tmp_path: Path) -> None:
         time.sleep(0.5)
         with pytest.raises(PolicyError, match="no action from the policy"):
             robot.infer({"state": np.array([-1.0])})
+
+
+@pytest.mark.realtime
+def test_the_documented_programs_run(tmp_path: Path) -> None:
+    """A served function, `Robot`, and openpi's client through `policy join`."""
+    text = (Path(__file__).parents[2] / "docs" / "policy.md").read_text()
+    programs = dict(re.findall(r"```python\n# (\w+)\.py\n(.*?)```", text, re.DOTALL))
+    assert all(program.count("\n") <= 30 for program in programs.values())
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        server = f"127.0.0.1:{free.getsockname()[1]}"
+
+    def line(name: str, old: str, new: str) -> list[str]:
+        assert old in programs[name]
+        (tmp_path / name).write_text(programs[name].replace(old, new))
+        return [sys.executable, "-P", str(tmp_path / name)]
+
+    with subprocess.Popen(line("serving", "127.0.0.1:47010", server)) as serving:
+        try:
+            run = ran(*line("robot", "127.0.0.1:47010", server))
+            assert run.stdout.startswith("{'rows': 20} [ 0."), run
+            with joined(server, "--rows", "10", "--resize", "224") as robot:
+                run = ran(*line("openpi_robot", "8001", robot.rpartition(":")[2]))
+            assert run.stdout.startswith("{'rows': 20} [ 0."), run
+        finally:
+            serving.terminate()
 
 
 @pytest.mark.parametrize(
