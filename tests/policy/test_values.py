@@ -12,9 +12,12 @@ from hypothesis.extra import numpy as arrays
 from openpi_client import image_tools, msgpack_numpy
 from PIL import Image
 
+from policy_lab import OPTIONS, ramp
 from skytether.policy import values
 from skytether.policy.images import Compressor, Unpacker
+from skytether.policy.robot import FrameType
 from skytether.policy.values import ValueRefused
+from skytether.policy.virtual import Emulated
 
 KINDS = st.sampled_from(["<f4", "<f8", "|u1", "<i8", "|b1", ">i2", "<U3", "|S2"]).map(np.dtype)
 LEAVES = (
@@ -58,6 +61,37 @@ def test_arrays_arrive_as_openpis_own_client_would_send_them() -> None:
         packed = values.pack({"key": array})
         assert packed == msgpack_numpy.packb({"key": array})
         assert same(values.unpack(packed)["key"], array)
+
+
+METADATA = bytes.fromhex(
+    "82aa72657365745f706f736592cb0000000000000000cbbff8000000000000a46e616d65a87265636f72646564"
+)
+OBSERVATION = (
+    b"\x83\xb1observation/state\x84\xc4\x0b__ndarray__\xc3\xc4\x04data\xc4\x08\0\0\0\0\0\0\x80?"
+    b"\xc4\x05dtype\xa3<f4\xc4\x05shape\x91\x02\xb3observation/gripper\x83\xc4\r__npgeneric__\xc3"
+    b"\xc4\x04data\xcb?\xd0\0\0\0\0\0\0\xc4\x05dtype\xa3<f4\xa6prompt\x84\xc4\x0b__ndarray__\xc3"
+    b"\xc4\x04data\xc4\x08g\0\0\0o\0\0\0\xc4\x05dtype\xa3<U2\xc4\x05shape\x90"
+)
+REPLY = (
+    b"\x83\xa7actions\x84\xc4\x0b__ndarray__\xc3\xc4\x04data\xc4\x18\0\0\0\0\0\0\x80?\0\0\0@\0\0@@"
+    b"\0\0\x80@\0\0\xa0@\xc4\x05dtype\xa3<f4\xc4\x05shape\x92\x03\x02\xa5state\x84\xc4\x0b__ndarray__"
+    b"\xc3\xc4\x04data\xc4\x08\0\0\0\0\0\0\xe0?\xc4\x05dtype\xa3<f8\xc4\x05shape\x91\x01"
+    b'\xadserver_timing\x82\xa8infer_ms\xcb?\x85\x81\x06"\0\0\0\xadprev_total_ms\xcb@)\t8\xdex\x80\0'
+)
+
+
+def test_what_openpis_server_and_client_exchange_passes_unchanged() -> None:
+    """Messages recorded between openpi's own server (15a9616) and its client from PyPI (0.1.2)."""
+    lab = Emulated(ramp, OPTIONS, metadata=values.unpack(METADATA), thinking=None)
+    lab.connect()
+    lab.say(FrameType.MESSAGE.value + OBSERVATION)
+    asked: list[bytes] = []
+    lab._ask = lambda payload, _: asked.append(payload)  # type: ignore[method-assign]
+    lab.sleep(0.05)
+    lab.policy_says(FrameType.MESSAGE.value + REPLY, ("policy", 1))
+    lab.sleep(0.05)
+    assert asked == [FrameType.MESSAGE.value + OBSERVATION]
+    assert [said for _, said in lab.answers] == [b"m" + METADATA, b"m" + REPLY]
 
 
 @given(st.binary(max_size=200))
