@@ -25,6 +25,7 @@ from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shared.endpoints.line import HOST_PORT, parse_address
 from skytether.shared.events.flight import Event
+from skytether.shared.events.processes import Listening
 from skytether.shared.wire import keys as keyrings
 from skytether.shell.driving.driver import Shell, new_event_loop, run
 from skytether.shell.host.udp import is_loopback
@@ -159,7 +160,10 @@ def serve(
     _check_sealed("bind", at, secure=bool(keys) or insecure)
     line = partial(_FunctionLine, infer, {} if metadata is None else metadata)
     end = policy_end(gate, gives_rows=gives_rows)
-    run([Shell(end, at, line=lambda hear, _: line(hear))], on_event=on_event)
+    shell = Shell(end, at, line=lambda hear, _: line(hear))
+    host, port = shell.address
+    begun = Listening(host=host, port=port, waiting_for="robots")
+    run([shell], on_start=lambda: on_event(begun), on_event=on_event)
 
 
 class _CallLine:

@@ -10,8 +10,8 @@ protocol, or `Robot.infer`. A call is an observation. It is answered
   program must stop the robot.
 
 The first call of a program waits for its chunk for up to `begin_ns`, since the robot has not moved.
-So does a call after the program has executed all rows and then paused for more than `hold_ns`, as
-between two episodes.
+So does a call after the program has executed all rows and then paused for more than `hold_ns` and
+PAUSE_NS, as between two episodes.
 
 A frame of the local connection begins with a byte of `FrameType`.
 """
@@ -66,6 +66,8 @@ MEASURED, ASKED_MAX = 9, 1024
 whose chunks are accepted."""
 ROWS_SENT = 64
 """Largest number of next rows that are sent with an observation."""
+PAUSE_NS = SECOND_NS
+"""Shortest pause of the program after which a new episode is assumed [ns]."""
 HELLOS = 4
 """Number of unanswered HELLOs after which the log says so."""
 REFUSALS = {
@@ -463,11 +465,11 @@ class RobotEnd(Endpoint):
         self._since = _SinceChunk(first=first)
 
     def _has_paused(self, program: _Program, now_ns: int) -> bool:
-        """Whether the program has made no call since its last row, for longer than `hold_ns`."""
+        """Whether the program has made no call since its last row, so that an episode begins."""
         ended_ns, answered_ns = program.schedule.since_ns, program.answered_ns
         if ended_ns is None or answered_ns is None or answered_ns > ended_ns:
             return False
-        return now_ns - ended_ns > self._options.hold_ns
+        return now_ns - ended_ns > max(self._options.hold_ns, PAUSE_NS)
 
     def _delay_steps(self) -> int:
         """Largest number of rows executed before a chunk could change them."""

@@ -153,8 +153,9 @@ def test_a_robot_in_python_with_a_policy_in_python(tmp_path: Path) -> None:
         "    if seen['state'][0] < 0:\n"
         "        raise RuntimeError('below zero')\n"
         "    return seen['state'][0] + np.arange(10.0)[:, None]\n"
-        "print('listening on 127.0.0.1:47910, soon', flush=True)\n"
-        "policy.serve(infer, bind='127.0.0.1:47910', metadata={'rows': 10})\n"
+        "def say(event):\n"
+        "    print(event, flush=True)\n"
+        "policy.serve(infer, bind='127.0.0.1:0', metadata={'rows': 10}, on_event=say)\n"
     )
     with (
         process(sys.executable, "-P", str(script)) as server,
