@@ -494,8 +494,10 @@ class RobotEnd(Endpoint):
             raise ProtocolError(Drop.FOR_ANOTHER_LIFE)
         call = self._call
         if error:
-            self._events.append(events.PolicyFailed(robot=self._robot, reason=error[:200]))
-            self._since.fault = f"error of the policy: {error[:200]}"
+            fault = f"error of the policy: {error[:200]}"
+            if fault != self._since.fault:
+                self._events.append(events.PolicyFailed(robot=self._robot, reason=error[:200]))
+            self._since.fault = fault
             return
         if program.newest < 0 and (call is None or call_number < call.number):
             why = "its call was answered with an error, and the robot may have been moved since"

@@ -360,6 +360,8 @@ class PolicyEnd(Endpoint):
         self._counts["observations"] += 1
         self._counts["replaced"] += robot.waiting is not None
         robot.waiting = _Job(call, left <= delay, observation, delay, held)
+        if robot.opens_ns and not robot.is_open:
+            robot.exchange.send(CHUNK, values.pack([call, b"", "no connection to the policy"]))
         self._ask(robot, now_ns)
 
     def _ask(self, robot: _Robot, now_ns: int) -> None:

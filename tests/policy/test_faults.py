@@ -552,6 +552,18 @@ def test_an_error_says_why_no_row_remains() -> None:
         lab.infer(state(30.0))
 
 
+def test_a_hold_says_that_the_policy_server_is_gone() -> None:
+    """Although no observation was with the policy server when its connection was lost."""
+    lab, position = flying()
+    lab._ask = lambda *_: None  # type: ignore[method-assign]
+    lab.policy_says(FrameType.CLOSED.value + b"killed", ("policy", lab.server._connections))
+    fly(lab, 8, position)
+    said = lab.robot.events()
+    (why,) = (each.reason for each in said if isinstance(each, events.Holding))
+    assert why == "error of the policy: no connection to the policy"
+    assert sum(isinstance(each, events.PolicyFailed) for each in said) == 1
+
+
 def test_a_policy_end_that_does_not_reply_is_logged_once() -> None:
     lab = Lab(ramp)
     lab.is_cut = True
