@@ -584,7 +584,8 @@ class RobotEnd(Endpoint):
             return f"no datagram from `policy serve` for {silence_ns / SECOND_NS:.1f} s"
         if not since.sent:
             return "the newest chunk has arrived after the time of its last row"
-        counts = f"{len(since.reported)} of the last {since.sent} observations"
+        reached = min(len(since.reported), since.sent)  # a first observation is sent repeatedly
+        counts = f"{reached} of the last {since.sent} observations"
         return f"by its reports {counts} have reached `policy serve`, but no chunk has arrived here"
 
     # -- time ----------------------------------------------------------------------------------
