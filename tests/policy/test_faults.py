@@ -24,12 +24,13 @@ from skytether.policy import events, metrics, values
 from skytether.policy.exchange import Exchange
 from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
-from skytether.policy.robot import FrameType, RobotEnd, RobotOptions
+from skytether.policy.robot import REFUSALS, FrameType, RobotEnd, RobotOptions
 from skytether.policy.serving import PolicyEnd
 from skytether.policy.virtual import ROBOT, SERVER, NoActionError
 from skytether.server.gate import PlainGate
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
+from skytether.shared.wire.protocol import Refusal
 from skytether.shell.processes.metrics import families
 
 KEYS = pytest.mark.parametrize("made", [Lab, secured], ids=["plain", "keys"])
@@ -179,7 +180,7 @@ def test_of_two_robots_with_one_key_the_newest_run_keeps_the_number() -> None:
             lab.server.receive(Datagram(each.payload, there), now_ns=lab.now_ns)
         lab.sleep(0.1)
     refused = [each for each in lab.robot.events() if isinstance(each, events.JoinRefused)]
-    assert "taken" in str(refused[-1])
+    assert REFUSALS[Refusal.TAKEN] in str(refused[-1])
     assert not any(isinstance(each, events.PolicySilent) for each in newer.events())
     lab.sleep(5)
     assert first_row(lab.infer(state(7.0))) == 7.0
