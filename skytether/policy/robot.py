@@ -124,7 +124,7 @@ class RobotOptions:
     """Length of a control step [ns]; None: measured as the time from an answer to the next call,
     divided by `rows`. Required with `plays_on`, because that time then does not measure steps."""
     rows: int = 1
-    """Number of rows that the program executes of each answer."""
+    """Number of rows that the program executes of each answer, which later chunks do not change."""
     plays_on: bool = False
     """Whether the robot continues to execute rows during a call."""
     spare_rows: int | None = None
@@ -477,8 +477,14 @@ class RobotEnd(Endpoint):
 
     def _is_needed(self, schedule: Schedule, now_ns: int) -> bool:
         spare, rows = self._options.spare_rows, self._options.rows
-        left = schedule.left(now_ns=now_ns)
-        return spare is None or left < max(spare + self._delay_steps(), rows)
+        left, delay = schedule.left(now_ns=now_ns), self._delay_steps()
+        if spare is None or left <= delay or left < rows or self._program is None:
+            return True
+        newest, asked = next(reversed(self._asked.items()), (-1, None))
+        step = schedule.advance(now_ns=now_ns)
+        if asked and newest > self._program.newest and step <= asked.step + delay:
+            return False  # the chunk of the newest observation may be under way
+        return left < spare + delay
 
     def _accept(self, message: bytes, now_ns: int) -> None:
         """Accept a chunk or an error of the policy."""
@@ -515,9 +521,11 @@ class RobotEnd(Endpoint):
         if program.answers_first:
             self._delays.clear()  # the policy may have compiled before its first chunk
         program.answers_first = program.newest < 0
-        steps = -(-delay_ns // schedule.step_ns)
-        if not self._options.plays_on:  # no row is executed while the program waits
-            steps = schedule.open_step(now_ns=now_ns) - asked.step
+        # The chunk is used in the answer to the next call: the program executes rows until then.
+        rows = 0 if call else self._options.rows
+        steps = schedule.open_step(rows, now_ns=now_ns) - asked.step
+        if self._options.plays_on:
+            steps = max(steps, -(-delay_ns // schedule.step_ns))
         self._delays.append((delay_ns, steps))
         if call_number > program.newest:
             program.newest, program.made_ns = call_number, asked.began_ns

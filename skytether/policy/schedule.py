@@ -145,12 +145,19 @@ class Schedule:
         step = int(self._count)
         self._end = step + len(self._coming(step, ROWS_MAX + HELD_MAX)[0])
 
-    def open_step(self, *, now_ns: int) -> int:
-        """First step whose row a chunk that arrives now can change."""
+    def open_step(self, rows: int, *, now_ns: int) -> int:
+        """First step whose row a chunk that arrives now can change.
+
+        Args:
+            rows: number of rows that the program executes of its last answer before the next call;
+                0 during a call.
+        """
         step = self.advance(now_ns=now_ns)
         if self._stands:
             return step
-        return self._given if self._rows else math.ceil(self._count)
+        if self._rows:
+            return self._given
+        return max(math.ceil(self._count), min(self._answered[0] + rows, self._given))
 
     def number(self, *, now_ns: int) -> int:
         """Number of the present step as the player counts steps; a chunk begins with this step."""

@@ -178,6 +178,25 @@ def test_while_the_policy_thinks_a_newer_observation_replaces_one_that_waits() -
     assert [int(each["state"][0]) for each in lab.asked][-1] == 7
 
 
+def test_while_a_needed_chunk_is_under_way_no_other_observation_is_sent() -> None:
+    """Chunks of 30 rows arrive after 4 steps, and are needed when 13 rows remain."""
+
+    def long_ramp(observation: Any) -> dict[str, Any]:
+        return {"actions": float(observation["state"][0]) + np.arange(30.0)[:, None]}
+
+    options = RobotOptions("absolute", MS, step_ns=20 * MS, plays_on=True, spare_rows=10)
+    far = {"to_policy": "constant(30ms)", "to_robot": "constant(30ms)"}
+    lab = Lab(long_ramp, options, **far)
+    lab.connect()
+    lab.infer(state(0.0))
+    for _ in range(85):
+        began_ns = lab.now_ns
+        lab.infer(state(0.0))
+        lab.run(began_ns + 20 * MS)
+    assert lab.robot.figures()["answers"]["hold"] == 0
+    assert len(lab.asked) == 5
+
+
 def test_observations_that_are_not_needed_are_not_sent() -> None:
     def flown(spare: int | None) -> tuple[int, dict[str, int]]:
         options = RobotOptions("absolute", 150 * MS, step_ns=20 * MS, spare_rows=spare)
@@ -471,8 +490,13 @@ def test_metadata_that_are_too_large_are_refused_by_name() -> None:
     assert f"metadata of {len(metadata)} B" in reason
 
 
-def test_committed_rows_are_executed_also_with_several_chunks_under_way() -> None:
-    """A call each step, and 6.5 steps from an observation to its chunk."""
+@pytest.mark.parametrize(
+    ("rows", "way_ms", "delay"), [(1, 65, 7), (1, 60, 7), (2, 65, 8), (3, 65, 9), (2, 60, 8)]
+)
+def test_committed_rows_are_executed_also_with_several_chunks_under_way(
+    rows: int, way_ms: int, delay: int
+) -> None:
+    """A chunk that arrives between two calls, or just after one, is used from the next call on."""
     rng, committed = np.random.default_rng(1), list[list[float]]()
 
     def continued(observation: Any) -> Any:
@@ -480,20 +504,20 @@ def test_committed_rows_are_executed_also_with_several_chunks_under_way() -> Non
         committed.append(rows[:, 0].tolist())
         return {"actions": np.concatenate([rows, rng.uniform(size=(12 - len(rows), 1))])}
 
-    options = RobotOptions("absolute", MS, step_ns=20 * MS, plays_on=True)
-    ways = {"to_policy": "constant(65ms)", "to_robot": "constant(65ms)"}
+    options = RobotOptions("absolute", MS, step_ns=20 * MS, rows=rows, plays_on=True)
+    ways = {"to_policy": f"constant({way_ms}ms)", "to_robot": f"constant({way_ms}ms)"}
     lab, executed = Lab(continued, options, gives_rows=True, **ways), list[float]()
     lab.connect()
     lab.infer(state(0.0))
     committed.clear()
     for _ in range(40):
         began_ns = lab.now_ns
-        executed.append(first_row(lab.infer(state(0.0))))
-        lab.run(began_ns + 20 * MS)
-    assert [len(each) for each in committed[20:]] == [7] * (len(committed) - 20)
+        executed += lab.infer(state(0.0))["actions"][:rows, 0].tolist()
+        lab.run(began_ns + rows * 20 * MS)
+    assert [len(each) for each in committed[20:]] == [delay] * (len(committed) - 20)
     assert len(committed) >= 35
-    for step, rows in enumerate(committed[20:33], start=20):
-        assert rows == executed[step : step + 7]
+    for call, coming in enumerate(committed[20:33], start=20):
+        assert coming == executed[call * rows : call * rows + delay]
 
 
 def test_chunks_under_way_to_the_previous_program_are_not_predicted() -> None:
