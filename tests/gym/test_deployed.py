@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from bench.players import Pendulum
+from bench.tasks import Pendulum
 from policy_lab import process
 from skytether.gym import Chunk, Networked
 from skytether.lab.engine.intervals import interval
@@ -95,7 +95,7 @@ def test_without_a_network_each_decision_is_that_over_udp(tmp_path: Path) -> Non
     script = tmp_path / "serves.py"
     script.write_text(
         "import numpy as np\n"
-        "from bench.players import Pendulum\n"
+        "from bench.tasks import Pendulum\n"
         "from skytether import policy\n"
         "def infer(seen):\n"
         "    return Pendulum().plan(seen['state'], np.zeros((0, 1))).astype(np.float32)\n"
