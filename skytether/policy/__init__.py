@@ -10,6 +10,7 @@
 | module | content |
 |---|---|
 | `robot`, `serving` | robot end and policy end, `RobotEnd` and `PolicyEnd`, without input/output |
+| `session` | session of the robot end: HELLO, keep-alives, and metadata |
 | `schedule`, `players` | received action chunks, and the row to execute at each control step |
 | `committed` | prediction of the rows that a robot executes until a new chunk can arrive |
 | `exchange`, `form`, `parts` | messages as datagrams with parity |

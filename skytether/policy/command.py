@@ -3,7 +3,7 @@
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -15,13 +15,13 @@ import msgspec
 from skytether.policy import inside, metrics, web
 from skytether.policy.images import QUALITY, Compressor
 from skytether.policy.pace import RATE_MAX, RATE_MIN
-from skytether.policy.players import Clocked, Freshest, Player, Queue
+from skytether.policy.players import Clocked, Freshest, Player
 from skytether.policy.robot import RobotEnd, RobotOptions
 from skytether.shared.base import extras
-from skytether.shared.base.units import SECOND_NS
-from skytether.shared.endpoints.endpoint import Endpoint
+from skytether.shared.base.units import seconds_to_ns
 from skytether.shared.events.flight import Event
 from skytether.shared.events.processes import Counted, Listening
+from skytether.shared.scenario.registry import Parameter
 from skytether.shared.telemetry.record import RECORDING
 from skytether.shell.commandline import command
 from skytether.shell.commandline.argument import Argument
@@ -29,7 +29,7 @@ from skytether.shell.commandline.command import CONFIGURATION, CommandError
 from skytether.shell.commandline.options import read
 from skytether.shell.driving.driver import Shell, run
 from skytether.shell.host.paths import NetworkPath
-from skytether.shell.host.udp import AddressError, is_loopback
+from skytether.shell.host.udp import is_loopback
 from skytether.shell.processes.log import Log, LogFormat
 from skytether.shell.processes.metrics import Metric
 from skytether.shell.processes.process import serving
@@ -37,13 +37,7 @@ from skytether.shell.processes.process import serving
 if TYPE_CHECKING:
     from skytether.policy.recording import CallRecording
 
-PLAYERS: dict[str, Callable[[], Player]] = {
-    "clock": Clocked,
-    "average": partial(Queue, "average"),
-    "drtc": Freshest,
-}
-UNITS_NS = {"us": 1e3, "ms": 1e6, "s": 1e9}
-RATES = {"kbit": 125.0, "mbit": 125e3, "gbit": 125e6}
+PLAYERS: dict[str, type[Player]] = {"clock": Clocked, "drtc": Freshest}
 
 ABOUT = """usage: skytether policy serve|join ...
 
@@ -125,10 +119,9 @@ class JoinOptions(EndOptions):
     when: str = "always"
     """Observations that are sent: always sends each; needed(N) sends an observation only if fewer
     than N rows will remain when its action chunk arrives, or fewer than --rows remain."""
-    merge: Literal["clock", "average", "drtc"] = "clock"
-    """Rule for a step with rows in several chunks: clock, the row of the newest chunk; average,
-    LeRobot's weighted average; drtc, DRTC's rule. clock counts steps by the clock; average and drtc
-    count executed rows."""
+    merge: Literal["clock", "drtc"] = "clock"
+    """Rule for a step with rows in several chunks: clock, the row of the newest chunk, where steps
+    are counted by the clock; drtc, DRTC's rule, where steps are counted by executed rows."""
     actions_key: str = "actions"
     """Key of the actions in the policy's replies."""
     resize: Annotated[int | None, Argument(metavar="PIXELS")] = None
@@ -184,9 +177,8 @@ def serve(argv: Sequence[str]) -> None:
         gives_rows=options.give_rows,
         rate_max=_rate(options.rate),
     )
-    bound: list[Any] = list(binds)
     line = partial(web.PolicyLine, options.upstream, options.api_key)
-    shell = _shell(end, bound, line=lambda hear, _: line(hear))
+    shell = Shell(end, [*binds], line=line)
     _drive("policy serve", end.figures, shell, options, "robots", metrics.SERVE)
 
 
@@ -242,10 +234,8 @@ def join(argv: Sequence[str]) -> None:
             compress=compress,
             on_answer=recording.note if recording else None,
         )
-        listen = partial(web.ProgramServer, listen_at)
-        shell = _shell(
-            end, None, paths=numbered, is_patient=True, line=lambda hear, _: listen(hear)
-        )
+        line = partial(web.ProgramServer, listen_at)
+        shell = Shell(end, None, paths=numbered, is_patient=True, line=line)
 
         def figures() -> dict[str, Any]:
             return end.figures() | {"image_bytes": compress.bytes}
@@ -299,13 +289,6 @@ def _robot_options(options: JoinOptions) -> RobotOptions:
     )
 
 
-def _shell(end: Endpoint, bind: list[Any] | None, **options: Any) -> Shell:
-    try:
-        return Shell(end, bind, **options)
-    except AddressError as error:
-        raise CommandError(str(error)) from None
-
-
 def _drive(
     name: str,
     figures: Callable[[], dict[str, Any]],
@@ -346,10 +329,10 @@ def _drive(
             command.write(options.json, msgspec.json.encode(last.figures))
 
 
-def _time_ns(flag: str, text: str, least_ns: int = 1) -> int:
+def _time_ns(flag: str, text: str, least_s: float = 1e-9) -> int:
     """Parse the time given to a flag, with its unit [ns]: 150 instead of 150ms is refused."""
     expected = "a time such as 150ms or 1.5s, at most an hour"
-    return round(_quantity(flag, text, UNITS_NS, (least_ns, 3600 * SECOND_NS), expected))
+    return seconds_to_ns(_quantity(flag, text, "time_s", (least_s, 3600.0), expected))
 
 
 def _rate(text: str | None) -> float:
@@ -357,15 +340,13 @@ def _rate(text: str | None) -> float:
     if text is None:
         return RATE_MAX
     expected = "a rate such as 4mbit, 100kbit to 1gbit"
-    return _quantity("--rate", text, RATES, (RATE_MIN, RATE_MAX), expected)
+    return _quantity("--rate", text, "bytes_per_s", (RATE_MIN, RATE_MAX), expected)
 
 
-def _quantity(
-    flag: str, text: str, units: Mapping[str, float], limits: tuple[float, float], expected: str
-) -> float:
-    found = re.fullmatch(r"(\d{1,6}(?:\.\d{1,9})?)([a-z]*)", text)
-    value = float(found[1]) * units.get(found[2], 0.0) if found else 0.0
-    if not limits[0] <= value <= limits[1]:
+def _quantity(flag: str, text: str, name: str, limits: tuple[float, float], expected: str) -> float:
+    """Parse a number with a unit; `name` ends with the unit of the result, see `registry.UNITS`."""
+    value = 0.0 if text == "0" else Parameter(name).without_unit(text)
+    if not isinstance(value, float) or not limits[0] <= value <= limits[1]:
         raise _wrong(flag, text, expected)
     return value
 

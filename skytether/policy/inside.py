@@ -4,21 +4,18 @@ import asyncio
 import queue
 import secrets
 import threading
-import traceback
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
-import numpy as np
-
 from skytether.client.link import ClientLink, PlainLink
 from skytether.policy import values
 from skytether.policy.images import QUALITY, Compressor, Unpacker
 from skytether.policy.robot import LINE, FrameType, RobotEnd, RobotOptions
 from skytether.policy.schedule import Actions
-from skytether.policy.serving import PolicyEnd
+from skytether.policy.serving import PolicyEnd, reply_of
 from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
@@ -87,7 +84,9 @@ class _FunctionLine:
 
     address = None
 
-    def __init__(self, infer: Callable[[Any], Any], metadata: Any, hear: Hear) -> None:
+    def __init__(
+        self, infer: Callable[[Any], Any], metadata: Any, hear: Hear, _: object = None
+    ) -> None:
         self._infer, self._hear = infer, hear
         self._metadata = values.pack(metadata)
         self._asked: dict[Address, bytes] = {}
@@ -116,13 +115,7 @@ class _FunctionLine:
             observation = self._asked.pop(peer, None)
             if observation is None:
                 continue
-            try:
-                reply = self._infer(values.unpack(observation, most=values.MADE_BYTES_MAX))
-                if isinstance(reply, np.ndarray):
-                    reply = {"actions": reply}
-                said = FrameType.MESSAGE.value + values.pack(reply)
-            except BaseException:  # SystemExit too must not end this thread
-                said = FrameType.ERROR.value + traceback.format_exc().encode()
+            said = reply_of(self._infer, observation)
             try:
                 loop.call_soon_threadsafe(self._hear, Datagram(said, peer, LINE))
             except RuntimeError:  # the loop has closed
@@ -160,7 +153,7 @@ def serve(
     _check_sealed("bind", at, secure=bool(keys) or insecure)
     line = partial(_FunctionLine, infer, {} if metadata is None else metadata)
     end = policy_end(gate, gives_rows=gives_rows)
-    shell = Shell(end, at, line=lambda hear, _: line(hear))
+    shell = Shell(end, at, line=line)
     host, port = shell.address
     begun = Listening(host=host, port=port, waiting_for="robots")
     run([shell], on_start=lambda: on_event(begun), on_event=on_event)
@@ -171,9 +164,14 @@ class _CallLine:
 
     address = None
 
-    def __init__(self, hear: Hear) -> None:
-        self.hear = hear
+    hear: Hear
+
+    def __init__(self) -> None:
         self.answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+
+    def open(self, hear: Hear, _: object) -> Self:
+        self.hear = hear
+        return self
 
     def send(self, payload: bytes, peer: Address) -> bool:  # noqa: ARG002 - there is only one
         self.answers.put(payload)
@@ -256,18 +254,12 @@ class Robot:
         boot_id = secrets.randbits(63)
         compress = Compressor(resize, quality, raw)
         self._end = RobotEnd(robot, {0: at}, link, options, boot_id=boot_id, compress=compress)
-        self._line: _CallLine | None = None
-        self._on_event = on_event
-        self._shell = Shell(self._end, None, [at], line=self._open)
+        self._line, self._on_event = _CallLine(), on_event
+        self._shell = Shell(self._end, None, [at], line=self._line.open)
         self._lock = threading.Lock()
         self._patience_s = max(deadline, options.begin_ns / SECOND_NS) + 5.0
 
-    def _open(self, hear: Hear, _: object) -> _CallLine:
-        self._line = _CallLine(hear)
-        return self._line
-
     def __enter__(self) -> Self:
-        assert self._line
         self._line.answers = queue.SimpleQueue()
         self._is_connected, self._unread = False, 0
         began: Future[None] = Future()
@@ -292,11 +284,9 @@ class Robot:
             runner.run(drive())
 
     def _say(self, said: bytes) -> None:
-        assert self._line
         self._loop.call_soon_threadsafe(self._line.hear, Datagram(said, PEER, LINE))
 
     def _answer(self) -> bytes:
-        assert self._line
         try:
             return self._line.answers.get(timeout=self._patience_s)
         except queue.Empty:

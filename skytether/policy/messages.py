@@ -8,6 +8,12 @@
 
 The first two fields, version and type, are those of `shared.wire.protocol`, so that the same
 channels encrypt the datagrams. Times are in microseconds modulo 2^32.
+
+The parts of a message join to a msgpack array, in the format of `values`:
+
+    OBSERVATION  [call, left, delay, held, observation]
+    CHUNK        [call, reply, error]
+    METADATA     [wants_rows, metadata]
 """
 
 from typing import Annotated, Any, Literal, NamedTuple
@@ -15,18 +21,17 @@ from typing import Annotated, Any, Literal, NamedTuple
 import msgspec
 from msgspec import Meta
 
+from skytether.policy import values
+from skytether.policy.committed import RobotRows
 from skytether.policy.form import PARITY_MAX, PART_BYTES_MAX
 from skytether.policy.parts import Part
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, VERSION, Refusal, kind_of
 
-NAME: Literal["policy"] = "policy"
-"""Name in a HELLO, which servers for vehicles ignore."""
 STAMPS = 2**32
 """Modulus of timestamps [µs]."""
-OBSERVATION, CHUNK, METADATA = range(3)
+OBSERVATION, CHUNK, METADATA = STREAMS = range(3)
 """Streams: observations to the policy end; action chunks and metadata to the robot end."""
-STREAMS = (OBSERVATION, CHUNK, METADATA)
 
 U8 = Annotated[int, Meta(ge=0, lt=2**8)]
 U16 = Annotated[int, Meta(ge=0, lt=2**16)]
@@ -39,7 +44,8 @@ class Hello(NamedTuple):
     robot: U16
     boot_id: U63
     """Random number of the robot end's run; a new run gets a new session."""
-    name: Literal["policy"] = NAME
+    name: Literal["policy"] = "policy"
+    """Makes servers for vehicles ignore the HELLO."""
 
 
 class Welcome(NamedTuple):
@@ -125,10 +131,31 @@ def decode(payload: bytes) -> Message:
         raise ProtocolError(Drop.VERSION)
     if kind not in _DECODERS:
         raise ProtocolError(Drop.TYPE)
-    count = payload[0] & 0x0F
+    # Decode the fields after version and type as an array, with a new one-byte header.
+    header = bytes((0x90 | max((payload[0] & 0x0F) - 2, 0),))
     try:
-        # Decode the fields after version and type as an array, with a new one-byte header.
-        message: Message = _DECODERS[kind].decode(bytes((0x90 | max(count - 2, 0),)) + payload[3:])
+        return _DECODERS[kind].decode(header + payload[3:])
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         raise ProtocolError(Drop.FIELD) from None
-    return message
+
+
+ObservationContent = tuple[int, int, int, RobotRows | None, bytes]
+"""Number of the call, number of rows that the robot has, delay bound d [steps], these rows (None if
+the policy end does not want rows), and serialized observation."""
+ChunkContent = tuple[int, bytes, str]
+"""Number of the call, serialized reply of the policy, and error; the reply or the error is empty.
+"""
+MetadataContent = tuple[bool, bytes]
+"""Whether observations are to include the robot's rows, and serialized metadata of the policy."""
+
+
+def content(kind: Any, message: bytes) -> Any:
+    """Content of a complete message; `kind` is the type of the content.
+
+    Raises:
+        ProtocolError: the message is no valid content of this kind.
+    """
+    try:
+        return msgspec.convert(values.unpack(message), kind)
+    except (values.ValueRefused, msgspec.ValidationError):
+        raise ProtocolError(Drop.FIELD) from None

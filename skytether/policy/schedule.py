@@ -9,6 +9,7 @@ executed more than `late_ns` after their planned time.
 """
 
 import math
+from collections import deque
 from contextlib import suppress
 from copy import copy
 from enum import StrEnum
@@ -19,10 +20,17 @@ from numpy.typing import NDArray
 
 from skytether.policy.players import HELD_MAX, Held, Player, Row
 from skytether.policy.values import ValueRefused
-from skytether.shared.base.units import SECOND_NS
+from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
 ROWS_MAX = 1024
 """Largest number of rows of a chunk."""
+STEP_NS_FIRST = 200 * MILLISECOND_NS
+"""Assumed length of a control step before it is measured [ns]. What a step takes longer counts as a
+pause until three intervals have been measured."""
+STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
+"""Bounds of the measured step length [ns]: a pause of the program is not a long step."""
+MEASURED = 9
+"""Number of newest intervals between calls that give the step length."""
 Actions = Literal["absolute", "delta"]
 """Type of the actions, which sets the hold action: last row for absolute, zeros for delta."""
 
@@ -54,8 +62,9 @@ class Schedule:
         player: rule that chooses the row of each step.
         actions: see `Actions`.
         key: key of the actions in the policy's reply.
-        step_ns: length of a control step [ns].
-        rows: number of rows that the program executes of each answer; None: the clock counts rows.
+        step_ns: length of a control step [ns], by which the clock counts rows; None: measured as
+            the time from an answer to the next call, divided by `rows`.
+        rows: number of rows that the program executes of each answer.
         late_ns: longest allowed delay of a row after its planned time [ns].
         began_ns: time of step 0 [ns].
     """
@@ -65,14 +74,19 @@ class Schedule:
         player: Player,
         actions: Actions,
         key: str,
-        step_ns: int,
-        rows: int | None,
+        step_ns: int | None,
+        rows: int,
         late_ns: int,
         began_ns: int,
     ) -> None:
         self._player, self._actions, self._key = player, actions, key
-        self._rows, self._late_ns = rows, late_ns
-        self.step_ns, self._at_ns = step_ns, began_ns
+        self._rows, self._late_ns = None if step_ns else rows, late_ns
+        """Number of rows that each call counts as executed; None: the clock counts rows."""
+        self.step_ns, self._at_ns = step_ns or STEP_NS_FIRST, began_ns
+        self._intervals_ns = deque([STEP_NS_FIRST * rows], MEASURED)
+        """Newest times from an answer to the next call [ns]; the first is an assumed value."""
+        self._answered_ns: int | None = None
+        """Time of the last answer [ns]."""
         self._count = 0.0
         self._end = 0
         """First step without a row in the received chunks."""
@@ -103,14 +117,26 @@ class Schedule:
 
         A call is made between two rows, so the counter is rounded to a whole number.
         """
+        if self._rows and self._answered_ns is not None:
+            self._intervals_ns.append(now_ns - self._answered_ns)
+            # Lower quartile: long pauses are more frequent than calls without executed rows.
+            measured_ns = sorted(self._intervals_ns)[len(self._intervals_ns) // 4]
+            self.step_ns = min(max(measured_ns // self._rows, STEP_NS_LEAST), STEP_NS_MOST)
         played = self._given if self._rows else round(self._by_clock(now_ns))
         self._move(max(played, int(self._count)), now_ns)
         self._stands = True
 
+    def has_paused(self, least_ns: int, *, now_ns: int) -> bool:
+        """Whether the program has made no call for `least_ns` since its last row."""
+        ended_ns, answered_ns = self.since_ns, self._answered_ns
+        if ended_ns is None or answered_ns is None or answered_ns > ended_ns:
+            return False
+        return now_ns - ended_ns > least_ns
+
     def go(self, *, now_ns: int) -> None:
         """Continue the step counter when the program gets its answer."""
         self._given = self.advance(now_ns=now_ns)
-        self._stands = False
+        self._stands, self._answered_ns = False, now_ns
 
     def advance(self, *, now_ns: int) -> int:
         """Advance the step counter to `now_ns`; returns the number of the present step."""

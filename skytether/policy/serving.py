@@ -22,8 +22,10 @@ from skytether.policy.messages import (
     METADATA,
     OBSERVATION,
     Hello,
+    ObservationContent,
     PartMessage,
     Welcome,
+    content,
     decode,
     encode,
 )
@@ -72,6 +74,9 @@ class _Job(NamedTuple):
 
 @dataclass(slots=True)
 class _Robot:
+    """Session of a robot, and its connection to the policy."""
+
+    number: int
     boot_id: int
     reply: ReplyPath
     exchange: Exchange
@@ -85,15 +90,15 @@ class _Robot:
     answered: tuple[int, bytes] = (-1, b"")
     """Number of the newest call with a chunk, and the message with that chunk."""
     under_way: UnderWay = field(default_factory=UnderWay)
-    asked_ns: int = 0
-    """Time at which the policy got the observation, or its connection began to open [ns]."""
-    is_open: bool = False
-    """Whether the connection to the policy is open."""
     connection: int = 0
-    """Number of the connection to the policy."""
-    opens_ns: int = 0
-    """Time at which a closed connection is reopened [ns]."""
-    is_opening: bool = False
+    """Number of the connection to the policy; 0 while it is closed."""
+    is_open: bool = False
+    """Whether the policy has sent its metadata over this connection."""
+    due_ns: int | None = None
+    """Time at which a closed connection is reopened, or at which a connection is given up because
+    metadata or a reply are missing [ns]; None: neither."""
+    was_lost: bool = False
+    """Whether a connection to the policy was lost before."""
     has_metadata: bool = False
     replaced: tuple[int, ...] = ()
     """`boot_id` of the newest earlier runs whose session this one ended."""
@@ -119,10 +124,9 @@ class PolicyEnd(Endpoint):
         boot_id: random number of this run.
         draw: returns an unpredictable 32-bit number, used as session number.
         patience_ns: longest time for a reply of the policy; then the connection is reopened [ns].
-        gives_rows: whether the keys `delay_steps`, `coming` and `committed` are added to an
-            observation: the largest recent number of rows executed between observation and chunk,
-            the rows that the robot will execute from the observation's step on, and the first
-            `delay_steps` of them, which are executed before the chunk arrives, see `committed`.
+        gives_rows: whether observations get the keys `delay_steps` (the delay bound d), `coming`
+            (the rows that the robot will execute from the observation's step on) and `committed`
+            (the first d of them), see module `committed`.
         rate_max: largest send rate to each robot [B/s].
         unpacker: makes the hook that decompresses the images of one observation, see
             `images.Unpacker`; None: images are not compressed.
@@ -146,8 +150,6 @@ class PolicyEnd(Endpoint):
         self._robots: dict[int, _Robot] = {}
         self._welcomed: dict[int, _Robot] = {}
         """Robots by number that have sent only a HELLO; the HELLO may be a replay."""
-        self._by_connection: dict[int, int] = {}
-        """Number of the robot of each connection to the policy."""
         self._connections = 0
         self._metadata: bytes | None = None
         self._drops = Counter[str]()
@@ -163,8 +165,7 @@ class PolicyEnd(Endpoint):
                 self._hear_robot(datagram, now_ns)
             except ProtocolError as error:
                 self._drops[error.reason] += 1
-            for answer in self._gate.outbox():
-                self._out.append(answer)
+            self._out += self._gate.outbox()
         self._send(now_ns)
 
     def _hear_robot(self, datagram: Datagram, now_ns: int) -> None:
@@ -177,8 +178,7 @@ class PolicyEnd(Endpoint):
             return
         if isinstance(message, Welcome):
             raise ProtocolError(Drop.NOT_FOR_A_SERVER)
-        number = self._number(message.session, call, now_ns)
-        robot = self._robots[number]
+        robot = self._robot(message.session, call, now_ns)
         if call.vehicle is None and (datagram.socket, datagram.peer) not in robot.paths:
             raise ProtocolError(Drop.ELSEWHERE)
         robot.hear(call.line, datagram, now_ns)
@@ -195,53 +195,48 @@ class PolicyEnd(Endpoint):
             self.send(call.line.seal(call.payload), datagram.peer, datagram.socket)
             self._give_metadata(robot)
 
-    def _number(self, session: int, call: GateCall, now_ns: int) -> int:
-        """Number of the robot that has this session.
+    def _robot(self, session: int, call: GateCall, now_ns: int) -> _Robot:
+        """Robot that has this session.
 
         Raises:
             ProtocolError: the session does not exist or belongs to another robot.
         """
-        if call.vehicle is not None:
-            welcomed = self._welcomed.get(call.vehicle)
-            if welcomed and welcomed.session == session:
-                self._begin(call.vehicle, now_ns)
-            robot = self._robots.get(call.vehicle)
-            if robot and robot.session == session:
-                return call.vehicle
-        else:
-            for number, each in self._robots.items():
-                if each.session == session:
-                    return number
+        for robots in (self._welcomed, self._robots):
+            for robot in robots.values():
+                if robot.session == session and call.vehicle in (None, robot.number):
+                    if robots is self._welcomed:
+                        self._begin(robot, now_ns)
+                    return robot
         raise ProtocolError(Drop.UNKNOWN_SESSION)
 
     def _welcome(self, hello: Hello, call: GateCall, datagram: Datagram, now_ns: int) -> None:
-        if call.vehicle is not None and hello.robot != call.vehicle:
+        number, is_plain = hello.robot, call.vehicle is None
+        if call.vehicle not in (None, number):
             raise ProtocolError(Drop.OF_ANOTHER_VEHICLE)
-        number = hello.robot
-        present, session = self._robots.get(number), 0
-        refusal = Refusal.ACCEPTED
+        present, robot, refusal = self._robots.get(number), None, Refusal.ACCEPTED
         if present is None and len(self._robots) >= ROBOTS_MAX:
             refusal = Refusal.FULL
         elif present and hello.boot_id != present.boot_id and now_ns - present.heard_ns < PATH_NS:
             # Without keys anybody may send this number; the robot with a session keeps it. With
             # keys the newest run gets it, and the one before must not take it back.
             is_here = (datagram.socket, datagram.peer) in present.paths
-            is_taken = not is_here if call.vehicle is None else hello.boot_id in present.replaced
+            is_taken = not is_here if is_plain else hello.boot_id in present.replaced
             refusal = Refusal.TAKEN if is_taken else Refusal.ACCEPTED
         if refusal is Refusal.ACCEPTED:
             of_run = (present, self._welcomed.get(number))
             robot = next((each for each in of_run if each and each.boot_id == hello.boot_id), None)
             if robot is None:
                 exchange = Exchange(self._new_session(), self._rate_max)
-                robot = self._welcomed[number] = _Robot(hello.boot_id, call.line, exchange, now_ns)
-            session = robot.session
-            if call.vehicle is None:
+                robot = _Robot(number, hello.boot_id, call.line, exchange, now_ns)
+                self._welcomed[number] = robot
+            if is_plain:
                 if robot is not present:
-                    self._begin(number, now_ns)
+                    self._begin(robot, now_ns)
                 robot.hear(call.line, datagram, now_ns)
+        session = robot.session if robot else 0
         welcome = Welcome(number, session, hello.boot_id, self._boot_id, refusal)
         self.send(call.line.seal(encode(welcome)), datagram.peer, datagram.socket)
-        if session:
+        if robot:
             self._gate.admit(call, now_ns=now_ns)
 
     def _new_session(self) -> int:
@@ -251,52 +246,50 @@ class PolicyEnd(Endpoint):
             pass
         return session
 
-    def _begin(self, number: int, now_ns: int) -> None:
+    def _begin(self, robot: _Robot, now_ns: int) -> None:
         """Begin the session of a robot that got a WELCOME, with a new connection to the policy,
         since a new episode begins.
         """
-        before, robot = self._robots.get(number), self._welcomed.pop(number)
-        if before:
+        if before := self._robots.get(robot.number):
             self._close(before)
             robot.replaced = (*before.replaced, before.boot_id)[-REPLACED_MAX:]
-        self._robots[number] = robot
+        self._robots[robot.number] = self._welcomed.pop(robot.number)
         robot.heard_ns = now_ns
-        self._open(number, robot, now_ns)
-        self._events.append(events.RobotJoined(robot=number))
+        self._open(robot, now_ns)
+        self._events.append(events.RobotJoined(robot=robot.number))
 
     # -- the policy ----------------------------------------------------------------------------
 
-    def _open(self, number: int, robot: _Robot, now_ns: int) -> None:
+    def _open(self, robot: _Robot, now_ns: int) -> None:
         self._connections += 1
-        robot.is_opening, robot.asked_ns, robot.connection = True, now_ns, self._connections
-        self._by_connection[robot.connection] = number
+        robot.connection, robot.due_ns = self._connections, now_ns + self._patience_ns
         self.send(FrameType.OPENED.value, (POLICY, robot.connection), LINE)
 
     def _close(self, robot: _Robot) -> None:
-        self._by_connection.pop(robot.connection, None)
         self.send(FrameType.CLOSED.value, (POLICY, robot.connection), LINE)
+        robot.connection, robot.is_open = 0, False
 
     def _hear_policy(self, said: bytes, connection: int, now_ns: int) -> None:
-        number = self._by_connection.get(connection)
-        if number is None:
+        robots = self._robots.values()
+        robot = next((each for each in robots if each.connection == connection), None)
+        if robot is None:
             return
-        robot = self._robots[number]
         match said[:1]:
             case FrameType.OPENED if len(said) - 1 > METADATA_BYTES_MAX:
                 reason = f"metadata of {len(said) - 1} B, expected at most {METADATA_BYTES_MAX}"
-                self._lose(number, robot, reason, now_ns)
+                self._lose(robot, reason, now_ns)
                 return
             case FrameType.OPENED:
-                robot.is_open, robot.is_opening = True, False
+                robot.is_open, robot.due_ns = True, None
                 self._metadata = said[1:]
-                self._events.append(events.UpstreamFound(robot=number))
+                self._events.append(events.UpstreamFound(robot=robot.number))
                 self._give_metadata(robot)
             case FrameType.CLOSED:
-                self._lose(number, robot, said[1:].decode(errors="replace"), now_ns)
+                self._lose(robot, said[1:].decode(errors="replace"), now_ns)
                 return
             case _ if robot.thinking is None:
                 # Otherwise each later observation would get the reply to the observation before.
-                self._lose(number, robot, "reply without an observation", now_ns)
+                self._lose(robot, "reply without an observation", now_ns)
                 return
             case FrameType.MESSAGE:
                 self._counts["answers"] += 1
@@ -305,22 +298,21 @@ class PolicyEnd(Endpoint):
                 reason = said[1:].decode(errors="replace").strip() or "unknown"
                 self._counts["errors"] += 1
                 last = reason.splitlines()[-1][:200]
-                self._events.append(events.PolicyFailed(robot=number, reason=last))
+                self._events.append(events.PolicyFailed(robot=robot.number, reason=last))
                 self._finish(robot, b"", last)
         self._ask(robot, now_ns)
 
-    def _lose(self, number: int, robot: _Robot, reason: str, now_ns: int) -> None:
-        if robot.is_open or not robot.opens_ns:
-            lost = events.UpstreamLost(robot=number, reason=reason[:200] or "closed")
+    def _lose(self, robot: _Robot, reason: str, now_ns: int) -> None:
+        if robot.is_open or not robot.was_lost:
+            lost = events.UpstreamLost(robot=robot.number, reason=reason[:200] or "closed")
             self._events.append(lost)
         self._close(robot)
-        robot.is_open = robot.is_opening = False
-        robot.opens_ns = now_ns + AGAIN_NS
         self._finish(robot, b"", f"connection to the policy lost: {reason[:100]}")
+        robot.due_ns, robot.was_lost = now_ns + AGAIN_NS, True
 
     def _finish(self, robot: _Robot, reply: bytes, error: str) -> None:
         """Send the policy's reply, or an error, to the robot."""
-        job, robot.thinking = robot.thinking, None
+        job, robot.thinking, robot.due_ns = robot.thinking, None, None
         if job is None:
             return
         message = values.pack([job.call, reply, error])
@@ -338,29 +330,27 @@ class PolicyEnd(Endpoint):
     def _give_metadata(self, robot: _Robot) -> None:
         is_due = not (robot.has_metadata or robot.exchange.is_sending(METADATA))
         if self._metadata is not None and is_due:
-            content = values.pack([self._gives_rows, self._metadata])
-            robot.exchange.send(METADATA, content)
+            message = values.pack([self._gives_rows, self._metadata])
+            robot.exchange.send(METADATA, message)
 
     def _observe(self, robot: _Robot, message: bytes, now_ns: int) -> None:
+        call, left, delay, held, seen = content(ObservationContent, message)
+        rows = held and held.rows
+        if rows is not None and not (rows.ndim and len(rows)):
+            raise ProtocolError(Drop.FIELD)
+        if any(job and job.call == call for job in (robot.thinking, robot.waiting)):
+            return  # a repeated observation
+        if call == robot.answered[0]:
+            robot.exchange.send(CHUNK, robot.answered[1], is_urgent=True)
+            return
         try:
-            call, left, delay, held, seen = values.unpack(message)
-            held = None if held is None else RobotRows(*held)
-            if not all(type(each) is int for each in (call, left, delay)):
-                raise ProtocolError(Drop.FIELD)
-            if held and not _is_valid(held):
-                raise ProtocolError(Drop.FIELD)
-            if any(job and job.call == call for job in (robot.thinking, robot.waiting)):
-                return  # a repeated observation
-            if call == robot.answered[0]:
-                robot.exchange.send(CHUNK, robot.answered[1], is_urgent=True)
-                return
             observation = values.unpack(seen, self._unpacker and self._unpacker())
-        except (ValueRefused, TypeError, ValueError):
+        except ValueRefused:
             raise ProtocolError(Drop.FIELD) from None
         self._counts["observations"] += 1
         self._counts["replaced"] += robot.waiting is not None
         robot.waiting = _Job(call, left <= delay, observation, delay, held)
-        if robot.opens_ns and not robot.is_open:
+        if robot.was_lost and not robot.is_open:
             robot.exchange.send(CHUNK, values.pack([call, b"", "no connection to the policy"]))
         self._ask(robot, now_ns)
 
@@ -370,58 +360,52 @@ class PolicyEnd(Endpoint):
             return
         job, robot.waiting = robot.waiting, None
         try:
-            content = values.pack(self._with_rows(job, robot.under_way))
+            frame = FrameType.MESSAGE.value + values.pack(self._with_rows(job, robot.under_way))
         except ValueError:  # rows of another shape than those of the policy
             self._drops[Drop.FIELD] += 1
             return
-        robot.thinking, robot.asked_ns = job, now_ns
-        self.send(FrameType.MESSAGE.value + content, (POLICY, robot.connection), LINE)
+        robot.thinking, robot.due_ns = job, now_ns + self._patience_ns
+        self.send(frame, (POLICY, robot.connection), LINE)
 
     def _with_rows(self, job: _Job, under_way: UnderWay) -> Any:
         """Observation with the rows that the robot will execute, if `gives_rows`."""
-        held = job.held
+        held, delay = job.held, job.delay
         if not (self._gives_rows and held and isinstance(job.observation, dict)):
             return job.observation
         under_way.acknowledge(held.acknowledged)
         player = Clocked()
         if held.rows is not None:
             player.accept(Held(held.acknowledged, held.step, held.rows), held.step)
-        rows, _ = under_way.predict(player, held.step, job.delay, ROWS_SENT)
-        keys: dict[str, Any] = {"delay_steps": job.delay}
+        rows, _ = under_way.predict(player, held.step, delay, ROWS_SENT)
+        keys: dict[str, Any] = {"delay_steps": delay}
         if rows:
             coming = np.stack(rows)
-            keys |= {"coming": coming, "committed": coming[: job.delay]}
+            keys |= {"coming": coming, "committed": coming[:delay]}
         return job.observation | keys
 
     # -- time ----------------------------------------------------------------------------------
 
     def next_wake_ns(self) -> int | None:
-        due = []
+        due: list[int | None] = []
         for robot in self._robots.values():
-            due.append(robot.heard_ns + SILENCE_NS)
-            if robot.thinking or robot.is_opening:
-                due.append(robot.asked_ns + self._patience_ns)
-            if not (robot.is_open or robot.is_opening):
-                due.append(robot.opens_ns)
-            if (sends_ns := robot.exchange.due_ns()) is not None:
-                due.append(sends_ns)
-        return min(due, default=None)
+            due += [robot.heard_ns + SILENCE_NS, robot.due_ns, robot.exchange.due_ns()]
+        return min((each for each in due if each is not None), default=None)
 
     def wake(self, *, now_ns: int) -> None:
-        for number, robot in list(self._robots.items()):
+        for robot in list(self._robots.values()):
             silence_ns = now_ns - robot.heard_ns
             if silence_ns >= SILENCE_NS:
                 silence_s = silence_ns / SECOND_NS
-                self._events.append(events.RobotSilent(robot=number, silence_s=silence_s))
+                self._events.append(events.RobotSilent(robot=robot.number, silence_s=silence_s))
                 self._close(robot)
-                del self._robots[number]
+                del self._robots[robot.number]
+            elif robot.due_ns is None or now_ns < robot.due_ns:
                 continue
-            is_asked = robot.thinking or robot.is_opening
-            if is_asked and now_ns - robot.asked_ns >= self._patience_ns:
+            elif robot.connection:
                 waited_s = self._patience_ns / SECOND_NS
-                self._lose(number, robot, f"no reply within {waited_s:g} s", now_ns)
-            if not (robot.is_open or robot.is_opening) and now_ns >= robot.opens_ns:
-                self._open(number, robot, now_ns)
+                self._lose(robot, f"no reply within {waited_s:g} s", now_ns)
+            else:
+                self._open(robot, now_ns)
         self._send(now_ns)
 
     def _send(self, now_ns: int) -> None:
@@ -446,8 +430,16 @@ class PolicyEnd(Endpoint):
         }
 
 
-def _is_valid(held: RobotRows) -> bool:
-    key, step, acknowledged, rows = held
-    is_array = isinstance(rows, np.ndarray) and rows.ndim > 0 and len(rows) > 0
-    kinds = type(key), type(step), type(acknowledged)
-    return kinds == (str, int, int) and (rows is None or is_array)
+def reply_of(infer: Callable[[Any], Any], observation: bytes) -> bytes:
+    """Frame with the reply of a function, used as policy, to a serialized observation.
+
+    Args:
+        infer: returns the array of actions, or a dict with it as `actions`; an exception is an
+            error of the policy.
+    """
+    try:
+        reply = infer(values.unpack(observation, most=values.MADE_BYTES_MAX))
+        reply = {"actions": reply} if isinstance(reply, np.ndarray) else reply
+        return FrameType.MESSAGE.value + values.pack(reply)
+    except (Exception, SystemExit) as error:  # a policy must not end the process
+        return FrameType.ERROR.value + f"{type(error).__name__}: {error}".encode()

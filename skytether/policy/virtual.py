@@ -1,8 +1,7 @@
 """Both ends over an emulated network in virtual time, to evaluate a policy before deployment.
 
-    options = RobotOptions("absolute", deadline_ns=150_000_000, step_ns=20_000_000)
-    robot = Emulated(policy, options, to_policy="constant(50ms) & loss(5%)",
-                     to_robot="constant(50ms) & loss(5%)", thinking=0.086)
+    robot = Emulated(policy, RobotOptions("absolute", deadline_ns=150_000_000, step_ns=20_000_000),
+                     to_policy="constant(50ms) & loss(5%)", to_robot="constant(50ms)")
     robot.connect()
     reply = robot.infer(observation)   # advances the virtual time until the answer
     robot.sleep(0.1)                   # the robot executes five rows
@@ -22,7 +21,7 @@ from skytether.netem.impairments.direction import impairments
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
 from skytether.policy import values
 from skytether.policy.robot import LINE, FrameType, RobotEnd, RobotOptions
-from skytether.policy.serving import PolicyEnd
+from skytether.policy.serving import PolicyEnd, reply_of
 from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
@@ -45,8 +44,7 @@ class Emulated:
     """Robot program and policy at the two ends of an emulated network, in virtual time.
 
     Args:
-        policy: function from an observation to the reply, a dict with an array `actions`; an
-            exception counts as an error of the policy.
+        policy: function from an observation to the reply, see `serving.reply_of`.
         options: options of the robot end.
         to_policy, to_robot: network impairments of each direction (`skytether list impairments`).
         thinking: computation time of the policy [s]; None: it never replies.
@@ -81,14 +79,8 @@ class Emulated:
         self._policy, self._metadata = policy, values.pack(metadata)
         self.thinking_ns = None if thinking is None else seconds_to_ns(thinking)
         sessions = count(1)
-        self.robot = RobotEnd(
-            1,
-            {0: SERVER},
-            link or PlainLink(),
-            options,
-            boot_id=boot_ids[0],
-            compress=compress,
-        )
+        link = link or PlainLink()
+        self.robot = RobotEnd(1, {0: SERVER}, link, options, boot_id=boot_ids[0], compress=compress)
         self.server = PolicyEnd(
             gate or PlainGate(),
             boot_id=boot_ids[1],
@@ -101,10 +93,7 @@ class Emulated:
         """Time [ns] and content of each frame sent to the program, see `robot.FrameType`."""
         self.is_cut = False
         """Whether the network is cut."""
-        self._ways = [
-            _way(to_policy, seed, "to_policy"),
-            _way(to_robot, seed, "to_robot"),
-        ]
+        self._ways = _way(to_policy, seed, "to_policy"), _way(to_robot, seed, "to_robot")
         self._later: list[tuple[int, int, bytes, Address]] = []
         """Pending frames of the policy: due time [ns], order, frame, connection."""
         self._order = count()
@@ -157,11 +146,10 @@ class Emulated:
             self._collect(self.server)
             if stop():
                 return
-            ends = [self.robot.next_wake_ns(), self.server.next_wake_ns()]
-            ends += [link.next_due_ns() for link, _ in self._ways]
-            due = [each for each in ends if each is not None]
-            due += [self._later[0][0]] if self._later else []
-            next_ns = max(min([*due, until_ns]), self.now_ns)
+            due = [self.robot.next_wake_ns(), self.server.next_wake_ns(), until_ns]
+            due += [link.next_due_ns() for link, _ in self._ways]
+            due += [at_ns for at_ns, *_ in self._later[:1]]
+            next_ns = max(min(each for each in due if each is not None), self.now_ns)
             if next_ns >= until_ns:
                 self.now_ns = until_ns
                 return
@@ -196,18 +184,13 @@ class Emulated:
                     link.accept(Datagram(payload, peer, 0), lane, now_ns=self.now_ns)
 
     def _ask(self, payload: bytes, peer: Address) -> None:
-        if payload[:1] == FrameType.OPENED:
-            self._answer(FrameType.OPENED.value + self._metadata, peer, 0)
-        elif payload[:1] == FrameType.MESSAGE and self.thinking_ns is not None:
-            try:
-                said = FrameType.MESSAGE.value + values.pack(
-                    self._policy(values.unpack(payload[1:], most=values.MADE_BYTES_MAX))
-                )
-            except Exception as error:
-                said = FrameType.ERROR.value + str(error).encode()
-            self._answer(said, peer, self.thinking_ns)
-
-    def _answer(self, said: bytes, peer: Address, after_ns: int) -> None:
+        said, after_ns = FrameType.OPENED.value + self._metadata, 0
+        if payload[:1] == FrameType.MESSAGE:
+            if self.thinking_ns is None:
+                return
+            said, after_ns = reply_of(self._policy, payload[1:]), self.thinking_ns
+        elif payload[:1] == FrameType.CLOSED:
+            return
         heappush(self._later, (self.now_ns + after_ns, next(self._order), said, peer))
 
 

@@ -13,21 +13,21 @@ from itertools import count
 
 from websockets.asyncio.client import connect
 from websockets.asyncio.connection import Connection
-from websockets.asyncio.server import ServerConnection, serve
+from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.exceptions import ConnectionClosed, InvalidURI, WebSocketException
 from websockets.http11 import Request, Response
+from websockets.uri import parse_uri
 
 from skytether.policy.robot import LINE, FrameType
-from skytether.policy.values import MADE_BYTES_MAX
+from skytether.policy.values import BYTES_MAX, MADE_BYTES_MAX
 from skytether.shared.endpoints.endpoint import Address, Datagram
 from skytether.shell.host.tcp import listen_tcp
 from skytether.shell.host.udp import from_kernel
 
-ANSWERS_MAX = 16
-"""Largest number of answers that a program may leave unread; then its connection is closed."""
+UNREAD_BYTES_MAX = 4 * BYTES_MAX
+"""Size of answers that a program may leave unread [B]; then its connection is closed."""
 PROGRAM = "program"
 Hear = Callable[[Datagram], None]
-Messages = asyncio.Queue[bytes | str]
 
 
 class ProgramServer:
@@ -37,23 +37,24 @@ class ProgramServer:
         AddressError: the address cannot be bound.
     """
 
-    def __init__(self, bind: Address, hear: Hear) -> None:
+    def __init__(self, bind: Address, hear: Hear, _: object = None) -> None:
         self._hear = hear
-        self._connections: dict[int, tuple[ServerConnection, Messages]] = {}
+        self._connections: dict[int, ServerConnection] = {}
         self._closing = set[asyncio.Task[None]]()
         self._numbers = count(1)
         self._socket = listen_tcp(bind)
         self.address: Address = from_kernel(self._socket.getsockname())
 
     def send(self, payload: bytes, peer: Address) -> bool:
-        if peer[1] not in self._connections:
+        connection = self._connections.get(peer[1])
+        if connection is None:
             return False
-        connection, answers = self._connections[peer[1]]
-        if answers.full():
+        if connection.transport.get_write_buffer_size() > UNREAD_BYTES_MAX:
             self._close(connection, "the program does not read its answers")
             return False
         said = payload[1:]
-        answers.put_nowait(said.decode() if payload[:1] == FrameType.ERROR else said)
+        # `broadcast` does not wait, unlike `send`.
+        broadcast([connection], said.decode() if payload[:1] == FrameType.ERROR else said)
         return True
 
     def _close(self, connection: ServerConnection, reason: str) -> None:
@@ -68,6 +69,8 @@ class ProgramServer:
             sock=self._socket,
             compression=None,
             max_size=2 * MADE_BYTES_MAX,
+            # A page in a browser, which names its origin, must not replace the robot program.
+            origins=[None],
             process_request=_health,
         ):
             await asyncio.get_running_loop().create_future()
@@ -75,19 +78,16 @@ class ProgramServer:
     async def _serve(self, connection: ServerConnection) -> None:
         number = next(self._numbers)
         peer = PROGRAM, number
-        for each, _ in self._connections.values():
+        for each in self._connections.values():
             self._close(each, "another program has connected")
-        answers = Messages(ANSWERS_MAX)
-        self._connections[number] = connection, answers
+        self._connections[number] = connection
         self._hear(Datagram(FrameType.OPENED.value, peer, LINE))
-        writer = asyncio.get_running_loop().create_task(_write(connection, answers))
         try:
             with suppress(ConnectionClosed):
                 async for message in connection:
                     said = message.encode() if isinstance(message, str) else message
                     self._hear(Datagram(FrameType.MESSAGE.value + said, peer, LINE))
         finally:
-            writer.cancel()
             del self._connections[number]
             self._hear(Datagram(FrameType.CLOSED.value, peer, LINE))
 
@@ -102,38 +102,31 @@ class PolicyLine:
 
     address = None
 
-    def __init__(self, url: str, api_key: str, hear: Hear) -> None:
+    def __init__(self, url: str, api_key: str, hear: Hear, _: object = None) -> None:
         self._url, self._hear = url, hear
         self._headers = {"Authorization": f"Api-Key {api_key}"} if api_key else None
-        self._waiting: dict[Address, Messages] = {}
-        """Observations to be sent on each connection; at most one at a time."""
+        self._connections: dict[Address, Connection] = {}
         self._tasks: dict[Address, asyncio.Task[None]] = {}
 
     def send(self, payload: bytes, peer: Address) -> bool:
         match payload[:1]:
             case FrameType.OPENED:
-                self._waiting[peer] = Messages()
                 self._tasks[peer] = asyncio.get_running_loop().create_task(self._speak(peer))
-            case FrameType.CLOSED:
-                self._end(peer)
-            case FrameType.MESSAGE if peer in self._waiting:
-                self._waiting[peer].put_nowait(payload[1:])
+            case FrameType.CLOSED if task := self._tasks.pop(peer, None):
+                task.cancel()
+            case FrameType.MESSAGE if connection := self._connections.get(peer):
+                broadcast([connection], payload[1:])  # at most one observation at a time
         return True
-
-    def _end(self, peer: Address) -> None:
-        if task := self._tasks.pop(peer, None):
-            task.cancel()
-            del self._waiting[peer]
 
     async def run(self) -> None:
         try:
             await asyncio.get_running_loop().create_future()
         finally:
-            for peer in list(self._tasks):
-                self._end(peer)
+            for task in self._tasks.values():
+                task.cancel()
 
     async def _speak(self, peer: Address) -> None:
-        waiting, reason = self._waiting[peer], ""
+        reason = ""
         try:
             async with connect(
                 self._url,
@@ -146,26 +139,23 @@ class PolicyLine:
                 metadata = await connection.recv()
                 if isinstance(metadata, str):
                     raise TypeError("got text from the policy server, expected its metadata")
+                self._connections[peer] = connection
                 self._hear(Datagram(FrameType.OPENED.value + metadata, peer, LINE))
-                writer = asyncio.get_running_loop().create_task(_write(connection, waiting))
-                try:
-                    async for reply in connection:
-                        if isinstance(reply, str):
-                            said = FrameType.ERROR.value + reply.encode()
-                        else:
-                            said = FrameType.MESSAGE.value + reply
-                        self._hear(Datagram(said, peer, LINE))
-                finally:
-                    writer.cancel()
+                async for reply in connection:
+                    if isinstance(reply, str):
+                        said = FrameType.ERROR.value + reply.encode()
+                    else:
+                        said = FrameType.MESSAGE.value + reply
+                    self._hear(Datagram(said, peer, LINE))
         except (OSError, WebSocketException, TypeError) as error:
             reason = str(error) or type(error).__name__
+        finally:
+            self._connections.pop(peer, None)
         self._hear(Datagram(FrameType.CLOSED.value + reason.encode(), peer, LINE))
 
 
 def check_url(url: str) -> str:
     """Reason why an address of a policy server is invalid; empty if it is valid."""
-    from websockets.uri import parse_uri
-
     try:
         parse_uri(url)
     except (InvalidURI, ValueError) as error:
@@ -173,19 +163,8 @@ def check_url(url: str) -> str:
     return ""
 
 
-async def _write(connection: Connection, messages: Messages) -> None:
-    """Send the messages of a queue until the connection is closed."""
-    with suppress(ConnectionClosed):
-        while True:
-            await connection.send(await messages.get())
-
-
 def _health(connection: ServerConnection, request: Request) -> Response | None:
-    """Response to /healthz, as by openpi's server. Pages of a browser, which name their origin,
-    must not take the place of the robot program.
-    """
-    if "Origin" in request.headers:
-        return connection.respond(http.HTTPStatus.FORBIDDEN, "not for browsers\n")
+    """Response to /healthz, as by openpi's server."""
     if request.path == "/healthz":
         return connection.respond(http.HTTPStatus.OK, "OK\n")
     return None

@@ -421,7 +421,7 @@ def test_a_first_chunk_is_not_executed_after_its_call_was_answered_with_an_error
 
 
 def test_the_hold_action_is_the_last_row_that_was_executed() -> None:
-    schedule = Schedule(Clocked(), "absolute", "actions", 20 * MS, None, SECOND_NS, 0)
+    schedule = Schedule(Clocked(), "absolute", "actions", 20 * MS, 1, SECOND_NS, 0)
     first = {"actions": np.arange(6.0)[:, None]}
     schedule.accept(1, 0, 0.0, first, now_ns=0)
     assert schedule.answer(Kind.FRESH, now_ns=0).left == 6
@@ -433,7 +433,7 @@ def test_the_hold_action_is_the_last_row_that_was_executed() -> None:
 
 def test_the_hold_action_is_no_row_that_was_discarded_before_it_was_executed() -> None:
     """The robot has executed 3 of 6 rows, then the call takes longer than `late_ns`."""
-    schedule = Schedule(Clocked(), "absolute", "actions", 20 * MS, None, SECOND_NS, 0)
+    schedule = Schedule(Clocked(), "absolute", "actions", 20 * MS, 1, SECOND_NS, 0)
     schedule.accept(1, 0, 0.0, {"actions": np.arange(6.0)[:, None]}, now_ns=0)
     schedule.answer(Kind.FRESH, now_ns=0)
     schedule.stand(now_ns=60 * MS)

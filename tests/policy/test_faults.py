@@ -24,8 +24,9 @@ from skytether.policy import events, metrics, values
 from skytether.policy.exchange import Exchange
 from skytether.policy.images import Compressor, Unpacker
 from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
-from skytether.policy.robot import REFUSALS, FrameType, RobotEnd, RobotOptions
+from skytether.policy.robot import FrameType, RobotEnd, RobotOptions
 from skytether.policy.serving import PolicyEnd
+from skytether.policy.session import REFUSALS
 from skytether.policy.virtual import ROBOT, SERVER, NoActionError
 from skytether.server.gate import PlainGate
 from skytether.shared.base.units import MICROSECOND_NS, SECOND_NS
@@ -94,7 +95,7 @@ def test_a_robots_end_that_was_killed_and_restarted(made: Any, after_s: float) -
     """
     lab, _ = flying(made)
     link = (
-        lab.robot._link
+        lab.robot._session._link
         if made is Lab
         else SecureLink(keyed(), entropy=np.random.default_rng(8).bytes)
     )
@@ -155,7 +156,7 @@ def test_a_hello_of_an_earlier_run_ends_no_session() -> None:
         for each in lab.server.outbox():
             if each.peer[0] == "203.0.113.9":
                 earlier.receive(Datagram(each.payload, SERVER), now_ns=lab.now_ns)
-    assert earlier._exchange is not None
+    assert earlier._session.exchange is not None
     got, _ = fly(lab, 3, position)
     assert got == [20.0, 25.0, 30.0]
 
@@ -439,7 +440,9 @@ def test_stamps_that_wrap_and_messages_beyond_2_32(sent_us: int) -> None:
 
 def test_of_several_paths_one_is_dead() -> None:
     lab = Lab(ramp, **FAR)
-    lab.robot = RobotEnd(1, {0: SERVER, 2: ("192.0.2.9", 1)}, lab.robot._link, OPTIONS, boot_id=1)
+    lab.robot = RobotEnd(
+        1, {0: SERVER, 2: ("192.0.2.9", 1)}, lab.robot._session._link, OPTIONS, boot_id=1
+    )
     one = Around(lab.robot)
     one.leaves = lambda each: each.socket != 2
     lab.robot = one  # type: ignore[assignment]
@@ -528,7 +531,7 @@ def broken_line(seen: Any) -> Any:
     [
         ({}, True, 0.0, "by its reports 0 of the last 2 observations have reached"),
         ({"policy": long_ramp}, True, 0.0, "no datagram from `policy serve` for 1.9 s"),
-        ({"policy": broken_line}, False, 0.0, "error of the policy: no memory"),
+        ({"policy": broken_line}, False, 0.0, "error of the policy: RuntimeError: no memory"),
         ({}, True, 0.9, "the program made no call for 0.80 s"),
     ],
 )
@@ -549,7 +552,7 @@ def test_an_error_says_why_no_row_remains() -> None:
         with suppress(NoActionError):
             lab.infer(state(30.0))
         lab.sleep(0.1)
-    with pytest.raises(NoActionError, match="error of the policy: no memory"):
+    with pytest.raises(NoActionError, match="error of the policy: RuntimeError: no memory"):
         lab.infer(state(30.0))
 
 

@@ -209,6 +209,7 @@ def test_the_documented_programs_run(tmp_path: Path) -> None:
         (["join", "--actions", "delta"], "expected either HOST:PORT or --path"),
         (["join", "192.0.2.1:1", "--actions", "delta"], "--keys"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--deadline", "150"], "150ms"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--hold", "5"], "--hold"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "4"], "4mbit"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "90kbit"], "100kbit"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--when", "never"], "needed(2)"),

@@ -7,10 +7,11 @@ from contextlib import asynccontextmanager, suppress
 import pytest
 from websockets.asyncio.client import connect
 from websockets.asyncio.server import ServerConnection, serve
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.typing import Origin
 
 from skytether.policy.robot import FrameType
-from skytether.policy.web import ANSWERS_MAX, PolicyLine, ProgramServer
+from skytether.policy.web import UNREAD_BYTES_MAX, PolicyLine, ProgramServer
 from skytether.shared.endpoints.endpoint import Address, Datagram
 
 PEER: Address = ("policy", 1)
@@ -53,6 +54,17 @@ def test_a_new_program_is_heard_although_the_one_before_does_not_answer() -> Non
     asyncio.run(run())
 
 
+def test_a_page_in_a_browser_does_not_replace_the_program() -> None:
+    async def run() -> None:
+        heard = Heard()
+        async with program_line(heard) as (_, url):
+            with pytest.raises(InvalidStatus, match="403"):
+                await connect(url, origin=Origin("https://example.org"))
+            assert heard.empty()
+
+    asyncio.run(run())
+
+
 def test_a_program_that_reads_no_answer_is_closed() -> None:
     async def run() -> None:
         heard = Heard()
@@ -63,7 +75,7 @@ def test_a_program_that_reads_no_answer_is_closed() -> None:
             while line.send(answer, peer):
                 sent += 1
                 await asyncio.sleep(0)
-            assert sent <= ANSWERS_MAX + 8
+            assert sent <= UNREAD_BYTES_MAX // 4_000_000 + 8
             program.transport.abort()
             assert await heard.next() == (FrameType.CLOSED.value, peer)
         assert not line.send(answer, peer)
@@ -88,7 +100,7 @@ def upstream(
                 said.append((await heard.next())[0])
             line.send(FrameType.CLOSED.value, PEER)
             assert not line._tasks
-            assert not line._waiting
+            assert not line._connections
         return said
 
     return asyncio.run(run())
