@@ -339,7 +339,7 @@ def _rate(text: str | None) -> float:
     """Parse the rate given to --rate [B/s]."""
     if text is None:
         return RATE_MAX
-    expected = "a rate such as 4mbit, 100kbit to 1gbit"
+    expected = "a rate such as 4mbit, 50kbit to 1gbit"
     return _quantity("--rate", text, "bytes_per_s", (RATE_MIN, RATE_MAX), expected)
 
 

@@ -12,7 +12,7 @@ from typing import Any
 from skytether.policy import parts
 from skytether.policy.form import PART_HEAD_BYTES, block_parts, form_of
 from skytether.policy.messages import STAMPS, PartMessage, Report, encode
-from skytether.policy.pace import RATE_MAX, Pace, Tally, filtered
+from skytether.policy.pace import RATE_MAX, Pace, Tally, filtered, fit
 from skytether.policy.parts import Part, Reassembly
 from skytether.shared.base.units import HEADER_BYTES, MICROSECOND_NS, MILLISECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
@@ -30,12 +30,20 @@ class _Coming:
 
     number: int
     expected: int
-    first_ns: int
     last_ns: int = 0
+    """Receive time of the newest part [ns]."""
     sent_us: int = 0
+    """Send time of the first received part, by the sender's clock [µs]."""
     bytes: int = 0
     places: set[tuple[int, int]] = field(default_factory=set)
     """Block and index of each received part."""
+    times_us: list[tuple[int, int]] = field(default_factory=list)
+    """Send time after the first received part's, and receive time, of each received part [µs]."""
+
+
+def _signed(difference_us: int) -> int:
+    """Difference of two timestamps, without wrap-around [µs]."""
+    return (difference_us + STAMPS // 2) % STAMPS - STAMPS // 2
 
 
 class Exchange:
@@ -156,7 +164,7 @@ class Exchange:
         for i, more in enumerate(tally.add(part.number, expected, (part.block, part.place))):
             self._counted[i] += more
         if coming is None and spare is None:
-            coming = self._coming[stream] = _Coming(part.number, expected, now_ns)
+            coming = self._coming[stream] = _Coming(part.number, expected)
         if coming and part.number == coming.number:
             self._count(coming, message, now_ns)
             if len(coming.places) == coming.expected:
@@ -175,20 +183,25 @@ class Exchange:
         coming.places.add(place)
         self.came += 1
         coming.bytes += len(message.data) + PART_HEAD_BYTES + HEADER_BYTES
-        coming.last_ns, coming.sent_us = now_ns, message.sent_us
+        if not coming.times_us:
+            coming.sent_us = message.sent_us
+        coming.last_ns = now_ns
+        after_us = _signed(message.sent_us - coming.sent_us)
+        coming.times_us.append((after_us, now_ns // MICROSECOND_NS))
 
     def _report(self, stream: int, now_ns: int) -> None:
         coming = self._coming.pop(stream)
-        last_us = coming.last_ns // MICROSECOND_NS
+        train = fit(coming.times_us)
         seen = Report(
             self.session,
             stream,
             coming.number,
             len(coming.places),
             min(coming.bytes, 2**32 - 1),
-            (last_us - coming.sent_us) % STAMPS,
-            min((coming.last_ns - coming.first_ns) // MICROSECOND_NS, STAMPS - 1),
-            coming.sent_us,
+            (train.first_us - coming.sent_us) % STAMPS,
+            (train.last_us - coming.sent_us) % STAMPS,
+            min(train.spread_us, STAMPS - 1),
+            (coming.sent_us + coming.times_us[-1][0]) % STAMPS,
             min((now_ns - coming.last_ns) // MICROSECOND_NS, STAMPS - 1),
             *(min(each, 2**16 - 1) for each in self._counted),
         )
@@ -204,11 +217,12 @@ class Exchange:
             return
         round_trip_us = (now_ns // MICROSECOND_NS - seen.sent_us - seen.held_us) % STAMPS
         # The clock offset is unknown, so the delay is unwrapped relative to the previous one.
-        change_us = (seen.delay_us - self._delay_us + STAMPS // 2) % STAMPS - STAMPS // 2
-        self._delay_us += change_us
+        self._delay_us += _signed(seen.last_us - self._delay_us)
+        growth_us = _signed(seen.last_us - seen.first_us)
         self.pace.heard(
             seen.came,
             seen.bytes,
+            (self._delay_us - growth_us) * MICROSECOND_NS,
             self._delay_us * MICROSECOND_NS,
             round_trip_us * MICROSECOND_NS,
             seen.spread_us * MICROSECOND_NS,

@@ -3,8 +3,8 @@
     HELLO    [1, 1, robot, boot_id, name]                         to the policy end, until answered
     WELCOME  [1, 2, robot, session, boot_id, server_boot_id, refusal]
     PART     [1, 20, session, stream, number, size, blocks, parity, block, place, sent_us, data]
-    REPORT   [1, 21, session, stream, number, came, bytes, delay_us, spread_us, sent_us, held_us,
-              counted, counted_came]
+    REPORT   [1, 21, session, stream, number, came, bytes, first_us, last_us, spread_us, sent_us,
+              held_us, counted, counted_came]
 
 The first two fields, version and type, are those of `shared.wire.protocol`, so that the same
 channels encrypt the datagrams. Times are in microseconds modulo 2^32.
@@ -90,11 +90,12 @@ class Report(NamedTuple):
     metadata."""
     bytes: U32
     """Bytes of the received parts, headers included [B]."""
-    delay_us: U32
-    """Receive time of the last part by the receiver's clock minus its `sent_us` [µs]: one-way delay
-    plus the unknown clock offset."""
+    first_us: U32
+    """One-way delay of the part sent first, plus the unknown clock offset, see `pace.fit` [µs]."""
+    last_us: U32
+    """Same of the part sent last [µs]."""
     spread_us: U32
-    """Time between receiving the first and the last part [µs]."""
+    """Time between receiving the two [µs]."""
     sent_us: U32
     """`sent_us` of the last received part [µs]."""
     held_us: U32

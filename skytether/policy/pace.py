@@ -1,39 +1,92 @@
 """Send rate and packet loss ratio of one direction, estimated from the receiver's reports.
 
-Delay-based congestion control: the queueing delay is the one-way delay minus its minimum over the
-last LEAST_NS. Above QUEUE_HIGH_NS the send rate is reduced below the received rate. Below
-QUEUE_LOW_NS the send rate is raised if it limited the sender. Loss alone does not reduce the send
-rate, because on radio links loss does not imply a queue. Compare LEDBAT (RFC 6817), NADA (RFC 8698)
-and Google's congestion control.
+Delay-based congestion control: the queueing delay is the one-way delay of a message's last part
+minus the minimum of the last LEAST_NS. A message counts as delayed if its queueing delay exceeds
+the jitter of its delay, which no send rate changes. If more than QUEUE_HIGH_NS remain, and the path
+has received the last messages at no more than the send rate, the send rate is reduced below the
+received rate, so that the queue becomes empty within about a second. Below QUEUE_LOW_NS the send
+rate is raised if it limited the sender. Loss alone does not reduce the send rate, because on radio
+links loss does not imply a queue. Compare LEDBAT (RFC 6817), NADA (RFC 8698) and Google's
+congestion control.
+
+Jitter delays each part of a message by another time. So the delays of the first and the last part,
+and the time between receiving them, are those of a straight line through the receive times
+(`fit`). A queue that fills makes this line steeper; jitter does not.
 """
 
 from collections import deque
+from statistics import linear_regression
+from typing import NamedTuple
 
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 
-RATE_FIRST, RATE_MIN = 1_250_000.0, 12_500.0
+RATE_FIRST, RATE_MIN = 1_250_000.0, 6_250.0
 """Send rate before the first report, and smallest send rate [B/s]."""
 RATE_MAX = 125_000_000.0
 """Largest send rate [B/s]."""
 BURST_BYTES = 3600
 """Largest burst: bytes that may be sent back to back [B]."""
 QUEUE_HIGH_NS, QUEUE_LOW_NS = 40 * MILLISECOND_NS, 15 * MILLISECOND_NS
-"""Queueing delay above which the send rate is reduced, and below which the rate is raised [ns]."""
+"""Queueing delay without jitter above which the send rate is reduced, and below which the rate is
+raised [ns]."""
+JITTERS, JITTER_GAIN = 2.0, 0.125
+"""Queueing delay that counts as jitter, in mean changes of the delay from message to message, and
+filter gain of this mean."""
+JITTER_MAX_NS = 80 * MILLISECOND_NS
+"""Largest change of the delay that counts as jitter, not as a queue that fills [ns]."""
 LOWERED_EVERY_NS = 200 * MILLISECOND_NS
 """Shortest time between two reductions [ns]."""
-LOWER, RISE = 0.85, 1.08
-"""Factors of the send rate at a reduction and at a raise."""
+LOWER, LOWER_MIN = 0.8, 0.5
+"""Largest and smallest factor of a reduction."""
+RISE_PER_S, RISE_NS_MAX = 0.5, 250 * MILLISECOND_NS
+"""Share by which the send rate is raised in a second [1/s], and longest time between two reports
+for which it is raised [ns]."""
 LEAST_NS = 10 * SECOND_NS
 """Window of the smallest delay [ns], in which clocks drift apart by less than 1 ms."""
 PARTS_MIN = 6
 """Smallest number of received parts whose rate counts as the rate of the path."""
+RECEIVED, RECEIVED_SHARE = 3, 1.1
+"""Number of newest received rates of which the largest is compared with the send rate, and the
+smallest ratio of the two at which the path is faster than the send rate."""
 LOSS_FIRST, LOSS_MAX = 0.02, 0.4
 """Packet loss ratio assumed before the first report, and largest estimate."""
 GAIN_UP, GAIN_DOWN = 0.3, 0.05
 """Filter gains for a reported loss above and below the estimate."""
+GAIN_PARTS = 80
+"""Number of sent parts above which GAIN_DOWN is larger, in proportion: on a slow path large
+messages are rare, and parity for a loss that has ended would make them rarer."""
 OVERTAKEN_MAX = 3
 """A message is counted in the loss when one arrives whose number is greater by more than this:
 messages may overtake each other."""
+
+
+class Fit(NamedTuple):
+    """Receive times of the parts of a message, smoothed by a straight line."""
+
+    first_us: int
+    """Delay of the part sent first [µs]."""
+    last_us: int
+    """Delay of the part sent last [µs]."""
+    spread_us: int
+    """Time between receiving the two [µs]."""
+
+
+def fit(times_us: list[tuple[int, int]]) -> Fit:
+    """Fit a line to the receive times of parts in the order of sending.
+
+    Args:
+        times_us: send and receive time of each received part, at least one [µs].
+    """
+    sent_us, came_us = zip(*sorted(times_us), strict=True)
+    slope_us, first_us = 0.0, float(came_us[0])
+    if len(times_us) > 1:
+        slope_us, first_us = linear_regression(range(len(times_us)), came_us)
+    spread_us = slope_us * (len(times_us) - 1)
+    last_us = first_us + spread_us
+    # Where a queue becomes empty within a message, the line is below all receive times.
+    least_us = min(came - sent for sent, came in times_us)
+    first_us, last_us = max(first_us - sent_us[0], least_us), max(last_us - sent_us[-1], least_us)
+    return Fit(round(first_us), round(last_us), max(round(spread_us), 0))
 
 
 class Tally:
@@ -69,7 +122,8 @@ class Tally:
 def filtered(loss: float, sent: int, came: int) -> float:
     """Packet loss ratio, from its last value and the number of parts sent and received since."""
     share = max(0.0, 1.0 - came / sent)
-    return min(loss + (GAIN_UP if share > loss else GAIN_DOWN) * (share - loss), LOSS_MAX)
+    gain = GAIN_UP if share > loss else min(GAIN_DOWN * max(sent / GAIN_PARTS, 1.0), GAIN_UP)
+    return min(loss + gain * (share - loss), LOSS_MAX)
 
 
 class Pace:
@@ -91,6 +145,16 @@ class Pace:
         """Newest queueing delay [ns]."""
         self._least: deque[tuple[int, int]] = deque()
         """Times and delays [ns] of a moving minimum; delays increase, the first is the minimum."""
+        self._jitter_ns = 0.0
+        """Mean change of the delay from one message to the next [ns]."""
+        self._last_ns: int | None = None
+        """Newest delay [ns]."""
+        self._received: deque[float] = deque(maxlen=RECEIVED)
+        """Newest received rates of messages of at least PARTS_MIN parts [B/s]."""
+        self._heard_ns = 0
+        """Time of the newest report [ns]."""
+        self._path = 0.0
+        """Received rate at the last reduction [B/s]."""
         self._lowered_ns = -LOWERED_EVERY_NS
         self._free_ns = 0
 
@@ -106,7 +170,8 @@ class Pace:
         self,
         came: int,
         size: int,
-        delay_ns: int,
+        first_ns: int,
+        last_ns: int,
         round_trip_ns: int,
         spread_ns: int,
         *,
@@ -118,27 +183,40 @@ class Pace:
         Args:
             came: number of parts received.
             size: bytes of the received parts [B].
-            delay_ns: one-way delay of the last part, plus an unknown constant clock offset [ns].
+            first_ns, last_ns: one-way delays of the parts sent first and last, see `fit`, plus an
+                unknown constant clock offset [ns].
             round_trip_ns: round-trip time of the last part, an upper bound of the queueing delay
                 [ns].
-            spread_ns: time between receiving the first and the last part [ns].
+            spread_ns: time between receiving these two parts [ns].
             was_limited: whether the send rate delayed the message.
         """
         self.round_trip_ns = round_trip_ns
-        if self._least and delay_ns - self._least[0][1] > round_trip_ns:
+        if self._least and last_ns - self._least[0][1] > 2 * round_trip_ns:
             self._least.clear()  # longer than the round-trip time: a clock was stepped
-        while self._least and self._least[-1][1] >= delay_ns:
+            self._last_ns = last_ns
+        least_ns = min(first_ns, last_ns)
+        while self._least and self._least[-1][1] >= least_ns:
             self._least.pop()
-        self._least.append((now_ns, delay_ns))
+        self._least.append((now_ns, least_ns))
         while self._least[0][0] < now_ns - LEAST_NS:
             self._least.popleft()
-        self.queue_ns = delay_ns - self._least[0][1]
-        if self.queue_ns > QUEUE_HIGH_NS:
-            if now_ns - self._lowered_ns >= LOWERED_EVERY_NS:
+        change_ns = 0 if self._last_ns is None else abs(last_ns - self._last_ns)
+        self._jitter_ns += JITTER_GAIN * (min(change_ns, JITTER_MAX_NS) - self._jitter_ns)
+        self._last_ns = last_ns
+        self.queue_ns = last_ns - self._least[0][1]
+        excess_ns = self.queue_ns - JITTERS * self._jitter_ns
+        if came >= PARTS_MIN:
+            self._received.append(size * (came - 1) / came / max(spread_ns, 1) * SECOND_NS)
+        received = max(self._received, default=self.rate)
+        if excess_ns > QUEUE_HIGH_NS:
+            is_due = now_ns - self._lowered_ns >= LOWERED_EVERY_NS
+            if is_due and received < RECEIVED_SHARE * self.rate:
                 self._lowered_ns = now_ns
-                lower = self.rate * LOWER
-                if came >= PARTS_MIN and spread_ns > 0:
-                    lower = min(lower, LOWER * size / spread_ns * SECOND_NS)
-                self.rate = max(lower, min(RATE_MIN, self._most))
-        elif self.queue_ns < QUEUE_LOW_NS and was_limited:
-            self.rate = min(self.rate * RISE, self._most)
+                self._path = min(received, self.rate)
+                share = max(min(LOWER, 1.0 - excess_ns / SECOND_NS), LOWER_MIN)
+                self.rate = max(share * self._path, min(RATE_MIN, self._most))
+        elif excess_ns < QUEUE_LOW_NS and was_limited:
+            since_s = min(now_ns - self._heard_ns, RISE_NS_MAX) / SECOND_NS
+            raised = max(self.rate * (1.0 + RISE_PER_S * since_s), LOWER * self._path)
+            self.rate = min(raised, self._most)
+        self._heard_ns = now_ns

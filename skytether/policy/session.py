@@ -126,7 +126,7 @@ class Session:
     def _say_alive(self, exchange: Exchange, now_ns: int) -> None:
         self._sent_ns = self._alive_ns = now_ns
         has = int(self._has_metadata)
-        alive = Report(exchange.session, METADATA, has, 0, 0, 0, 0, 0, 0, 0, 0)
+        alive = Report(exchange.session, METADATA, has, *[0] * 9)
         self._send_on_all(self._link.seal(encode(alive)))
 
     def _send_on_all(self, datagram: bytes) -> None:

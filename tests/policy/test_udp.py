@@ -211,7 +211,7 @@ def test_the_documented_programs_run(tmp_path: Path) -> None:
         (["join", "127.0.0.1:1", "--actions", "delta", "--deadline", "150"], "150ms"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--hold", "5"], "--hold"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "4"], "4mbit"),
-        (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "90kbit"], "100kbit"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "40kbit"], "50kbit"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--when", "never"], "needed(2)"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rows", "0"], "1 to 1024"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--listen", "0.0.0.0:1"], "--insecure"),
