@@ -233,7 +233,7 @@ class Schedule:
     def coming(self, count: int, *, now_ns: int) -> NDArray[Any] | None:
         """Next rows to execute, at most `count`; shape (n, *row), None if no row remains."""
         rows, _ = self._coming(self.advance(now_ns=now_ns), count)
-        return np.stack(rows) if rows else None
+        return np.stack(rows).astype(self._dtype, copy=False) if rows else None
 
     def _coming(self, step: int, count: int) -> tuple[list[Row], Row | None]:
         """At most `count` rows from a step on, and the row to repeat when rows have run out."""
