@@ -14,7 +14,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from socketserver import ThreadingMixIn
 from typing import Any
@@ -43,6 +43,9 @@ REST_S = 0.02
 """Pause between two accepted connections [s]."""
 FRESH_S = 3.0
 """Age above which figures count as stale, and the process as stuck [s]."""
+OK, JSON = "200 OK", "application/json"
+Answer = tuple[str, str, bytes]
+"""Status, type and content of an answer."""
 BY_NAME = b"Host: expected a number, localhost, a name without a dot or that of --metrics\n"
 
 
@@ -98,7 +101,7 @@ class Collected(Collector):
     def health(self) -> tuple[str, bytes]:
         why = self.trouble()
         answer = {"process": self._process, "healthy": not why, "trouble": why}
-        return "503 Service Unavailable" if why else "200 OK", msgspec.json.encode(answer) + b"\n"
+        return "503 Service Unavailable" if why else OK, msgspec.json.encode(answer) + b"\n"
 
 
 class _Bounded(io.BufferedReader):
@@ -128,11 +131,12 @@ class _Handler(WSGIRequestHandler):
         super().end_headers()
 
 
-class Metrics(ThreadingMixIn, WSGIServer):
-    """HTTP server of a process's metrics, with one thread per connection.
+class BoundedServer(ThreadingMixIn, WSGIServer):
+    """HTTP server in a process that must not wait for it, with one thread per connection.
 
     Args:
         address: address to listen at; port 0 takes a free one.
+        answers: function for each path that gives the answer, called in a thread.
 
     Raises:
         MetricsError: listening at the address failed.
@@ -140,7 +144,7 @@ class Metrics(ThreadingMixIn, WSGIServer):
 
     daemon_threads = True
 
-    def __init__(self, address: Address, collected: Collected) -> None:
+    def __init__(self, address: Address, answers: Mapping[str, Callable[[], Answer]]) -> None:
         listening = _listening(address)
         super().__init__(listening.getsockname(), _Handler, bind_and_activate=False)
         self.socket.close()
@@ -150,10 +154,8 @@ class Metrics(ThreadingMixIn, WSGIServer):
         self.server_name, self.server_port = self.address
         self.setup_environ()
         self.set_app(self._answer)
-        self._collected = collected
+        self._answers = answers
         self._name = address[0].lower()
-        self._registry = CollectorRegistry(auto_describe=False)
-        self._registry.register(collected)
         self._connections: dict[socket.socket, float] = {}
         """Time at which each connection is closed, even without an answer [s]; oldest first."""
         self._thread = threading.Thread(target=self.serve_forever, args=(POLL_S,), daemon=True)
@@ -162,9 +164,6 @@ class Metrics(ThreadingMixIn, WSGIServer):
     def close(self) -> None:
         self.shutdown()
         self.server_close()
-
-    def take(self, figures: Mapping[str, Any]) -> None:
-        self._collected.take(figures)
 
     def get_request(self) -> tuple[socket.socket, Any]:
         time.sleep(REST_S)
@@ -196,18 +195,16 @@ class Metrics(ThreadingMixIn, WSGIServer):
         """Ignore the error: the client has disconnected, or is too slow."""
 
     def _answer(self, environ: WSGIEnvironment, start_response: StartResponse) -> Iterable[bytes]:
-        status, kind, body = "404 Not Found", "text/plain; charset=utf-8", b"/metrics or /healthz\n"
+        status, kind = "404 Not Found", "text/plain; charset=utf-8"
+        body = " or ".join(self._answers).encode() + b"\n"
         more = list(HEADERS.items())
         if not self._is_ours(environ.get("HTTP_HOST")):
             status, body = "403 Forbidden", BY_NAME
         elif environ["REQUEST_METHOD"] != "GET":
             status, body = "405 Method Not Allowed", b"only GET is supported\n"
             more.append(("Allow", "GET"))
-        elif environ["PATH_INFO"] == "/metrics":
-            status, kind, body = "200 OK", CONTENT_TYPE_LATEST, generate_latest(self._registry)
-        elif environ["PATH_INFO"] == "/healthz":
-            status, body = self._collected.health()
-            kind = "application/json"
+        elif answer := self._answers.get(environ["PATH_INFO"]):
+            status, kind, body = answer()
         start_response(status, [("Content-Type", kind), *more])
         return [body]
 
@@ -217,6 +214,30 @@ class Metrics(ThreadingMixIn, WSGIServer):
             return host is None
         name = host_name(host)
         return is_ours(name) or name == self._name or (name != "" and "." not in name)
+
+
+class Metrics(BoundedServer):
+    """HTTP server of a process's metrics.
+
+    Args:
+        address: see `BoundedServer`.
+    """
+
+    def __init__(self, address: Address, collected: Collected) -> None:
+        self._collected = collected
+        self._registry = CollectorRegistry(auto_describe=False)
+        self._registry.register(collected)
+        super().__init__(address, {"/metrics": self._figures, "/healthz": self._health})
+
+    def take(self, figures: Mapping[str, Any]) -> None:
+        self._collected.take(figures)
+
+    def _figures(self) -> Answer:
+        return OK, CONTENT_TYPE_LATEST, generate_latest(self._registry)
+
+    def _health(self) -> Answer:
+        status, body = self._collected.health()
+        return status, JSON, body
 
 
 def _listening(address: Address) -> socket.socket:
