@@ -107,10 +107,10 @@ docker-test: setup  ## the three containers, and what they survive; needs a Dock
 page-test: setup  ## the page in a real browser; needs Chromium, says so where there is none
 	$(ALONE) -m browser
 
-TOUR = flight-dark-wide network-light-wide cut-dark-wide duel-dark-wide
-tour-pictures: setup  ## pictures of README and the tour anew, from the page in a real browser
+TOUR = flight-dark-wide network-light-wide cut-dark-wide duel-dark-wide policy-dark-wide
+tour-pictures: setup  ## pictures of README, the tour and docs/policy.md anew, from the page in a real browser
 	$(ALONE) -m browser -k light_and_dark
-	$(ALONE) -m browser -k "cutting_the_link or a_duel"
+	$(ALONE) -m browser -k "cutting_the_link or a_duel or a_hold"
 	cp $(TOUR:%=page-test/%.png) docs/tour/
 
 autopilot-test: setup  ## actual autopilots in simulation: ARDUCOPTER=, PX4= name their programs

@@ -1,16 +1,23 @@
-"""Robot program and scripted policy in virtual time."""
+"""Robot program and scripted policy, in virtual time and over UDP."""
 
+import asyncio
 import json
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.reader import make_reader
+from openpi_client import msgpack_numpy
+from openpi_client.websocket_client_policy import WebsocketClientPolicy
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
 
+from helpers import SKYTETHER
 from skytether.client.secure import SecureLink
 from skytether.policy.robot import RobotOptions
 from skytether.policy.virtual import Emulated
@@ -132,3 +139,66 @@ def process(*line: str) -> Iterator[str]:
         finally:
             running.terminate()
             running.wait()
+
+
+class PolicyServer:
+    """Policy server with openpi's protocol: metadata, then a reply to each observation."""
+
+    def __init__(self) -> None:
+        self.thinking_s = 0.0
+        self.seen: list[Any] = []
+        started = threading.Event()
+
+        async def handle(connection: ServerConnection) -> None:
+            packer = msgpack_numpy.Packer()
+            await connection.send(packer.pack({"name": "ramp"}))
+            try:
+                async for message in connection:
+                    self.seen.append(msgpack_numpy.unpackb(message))
+                    await asyncio.sleep(self.thinking_s)
+                    if "fail" in self.seen[-1]:
+                        await connection.send("Traceback:\nRuntimeError: no memory")
+                    else:
+                        await connection.send(packer.pack(ramp(self.seen[-1])))
+            except ConnectionClosed:
+                pass
+
+        async def run() -> None:
+            self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
+            async with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
+                self.port = next(iter(server.sockets)).getsockname()[1]
+                started.set()
+                await self._end.wait()
+
+        self._thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
+        self._thread.start()
+        started.wait()
+
+    def close(self) -> None:
+        self._loop.call_soon_threadsafe(self._end.set)
+        self._thread.join()
+
+
+def command(*argv: str) -> AbstractContextManager[str]:
+    return process(*SKYTETHER, *argv)
+
+
+def served(policy: PolicyServer, *flags: str) -> AbstractContextManager[str]:
+    upstream = f"ws://127.0.0.1:{policy.port}"
+    return command("policy", "serve", "--upstream", upstream, "--bind", "127.0.0.1:0", *flags)
+
+
+def joined(server: str, *flags: str) -> AbstractContextManager[str]:
+    line = ("--listen", "127.0.0.1:0", "--actions", "absolute", "--rows", "5", *flags)
+    return command("policy", "join", server, *line)
+
+
+def calls(client: WebsocketClientPolicy, count: int, period_s: float = 0.1) -> Sequence[float]:
+    """Make calls, execute five rows of each answer; returns the executed rows."""
+    position, rows = 0.0, list[float]()
+    for _ in range(count):
+        reply = client.infer({"state": np.array([position]), "prompt": "go on"})
+        rows += reply["actions"][:5, 0].tolist()
+        position = rows[-1] + 1.0
+        time.sleep(period_s)
+    return rows

@@ -19,6 +19,7 @@
 | `values`, `images` | serialization of observations and actions |
 | `web` | websocket connections to the robot program and the policy server |
 | `recording` | calls in an MCAP file, with images |
+| `page` | live page of the calls, with `page.html` |
 | `inside` | Python interface: `serve` and `Robot` |
 | `command` | `skytether policy serve` and `skytether policy join` |
 | `virtual` | both ends over an emulated network, in virtual time |

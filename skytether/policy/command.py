@@ -16,11 +16,12 @@ from skytether.policy import inside, metrics, web
 from skytether.policy.images import QUALITY, Compressor
 from skytether.policy.pace import RATE_MAX, RATE_MIN
 from skytether.policy.players import Clocked, Freshest, Player
-from skytether.policy.robot import RobotEnd, RobotOptions
+from skytether.policy.robot import AnsweredCall, RobotEnd, RobotOptions
 from skytether.shared.base import extras
-from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.events.flight import Event
-from skytether.shared.events.processes import Counted, Listening
+from skytether.shared.base.units import MILLISECOND_NS, seconds_to_ns
+from skytether.shared.endpoints.endpoint import Address
+from skytether.shared.events.flight import Event, address_text
+from skytether.shared.events.processes import Counted, Listening, PageServed
 from skytether.shared.scenario.registry import Parameter
 from skytether.shared.telemetry.record import RECORDING
 from skytether.shell.commandline import command
@@ -35,6 +36,7 @@ from skytether.shell.processes.metrics import Metric
 from skytether.shell.processes.process import serving
 
 if TYPE_CHECKING:
+    from skytether.policy.page import CallPage
     from skytether.policy.recording import CallRecording
 
 PLAYERS: dict[str, type[Player]] = {"clock": Clocked, "drtc": Freshest}
@@ -139,6 +141,9 @@ class JoinOptions(EndOptions):
     """Number of this robot and its key, 0 to 65535, unique at the server."""
     record: Path | None = None
     """MCAP file for the recording, which Foxglove shows: observations with images, and answers."""
+    page: str | None = None
+    """HTTP address of a live page, as in 127.0.0.1:8080: answers, reasons for holds, network, and
+    images. Everybody who can reach the address can see them."""
 
 
 def policy(argv: Sequence[str]) -> None:
@@ -208,9 +213,11 @@ def join(argv: Sequence[str]) -> None:
         if not least <= value <= most:
             raise _wrong(flag, value, f"{least} to {most}")
     listen_at = command.address("--listen", options.listen)
-    if not (is_loopback(listen_at) or options.insecure):
-        expected = "an address of this machine alone, such as 127.0.0.1:8000, or --insecure"
-        raise _wrong("--listen", options.listen, expected)
+    page_at = command.address("--page", options.page) if options.page else None
+    for flag, local in (("--listen", listen_at), ("--page", page_at)):
+        if local and not (is_loopback(local) or options.insecure):
+            expected = "an address of this machine alone, such as 127.0.0.1:8000, or --insecure"
+            raise _wrong(flag, address_text(*local), expected)
     for option in ("json", "record"):
         command.claim_output(f"--{option}", getattr(options, option))
     if options.record and options.record.suffix != RECORDING:
@@ -221,9 +228,22 @@ def join(argv: Sequence[str]) -> None:
     # Socket 1 is the local connection, so the second path has number 2.
     numbered = {number + (number > 0): path for number, path in enumerate(paths)}
     with ExitStack() as stack:
-        recording = None
+        recording: CallRecording | None = None
+        page: CallPage | None = None
         if options.record:
             recording = stack.enter_context(_recorded(options.record, options.actions_key))
+        if page_at:
+            page = stack.enter_context(_shown(page_at, options))
+        watching = [each for each in (recording, page) if each]
+
+        def note(call: AnsweredCall) -> None:
+            for each in watching:
+                each.note(call)
+
+        def hear(event: Event) -> None:
+            for each in watching:
+                each.hear(event)
+
         compress = Compressor(options.resize, options.quality, options.raw)
         end = RobotEnd(
             options.robot,
@@ -232,7 +252,7 @@ def join(argv: Sequence[str]) -> None:
             _robot_options(options),
             boot_id=secrets.randbits(63),
             compress=compress,
-            on_answer=recording.note if recording else None,
+            on_answer=note,
         )
         line = partial(web.ProgramServer, listen_at)
         shell = Shell(end, None, paths=numbered, is_patient=True, line=line)
@@ -240,8 +260,30 @@ def join(argv: Sequence[str]) -> None:
         def figures() -> dict[str, Any]:
             return end.figures() | {"image_bytes": compress.bytes}
 
-        hear = recording.hear if recording else lambda _: None
-        _drive("policy join", figures, shell, options, "the robot program", metrics.JOIN, hear)
+        about = "the robot program", metrics.JOIN
+        _drive("policy join", figures, shell, options, *about, hear, page)
+
+
+@contextmanager
+def _shown(address: Address, options: JoinOptions) -> Iterator["CallPage"]:
+    """Serve the live page in the block."""
+    from skytether.policy.page import CallPage
+    from skytether.shell.processes.exporter import MetricsError
+
+    about = {
+        "robot": options.robot,
+        "server": options.server or ", ".join(options.path),
+        "actions": options.actions,
+        "deadline_ms": _time_ns("--deadline", options.deadline) / MILLISECOND_NS,
+        "hold_ms": _time_ns("--hold", options.hold) / MILLISECOND_NS,
+    }
+    try:
+        page = CallPage(address, about)
+    except MetricsError as error:
+        at = address_text(*address)
+        raise CommandError(f"--page: cannot listen at {at}: {error}", CONFIGURATION) from None
+    with closing(page):
+        yield page
 
 
 @contextmanager
@@ -297,6 +339,7 @@ def _drive(
     waiting_for: str,
     table: Sequence[Metric],
     beside: Callable[[Event], None] = lambda _: None,
+    page: "CallPage | None" = None,
 ) -> None:
     with (
         closing(Log(name, options.log, beside)) as out,
@@ -306,6 +349,8 @@ def _drive(
         def start() -> None:
             host, port = shell.address
             out.say(Listening(host=host, port=port, waiting_for=waiting_for))
+            if page:
+                out.say(PageServed(address=f"http://{address_text(*page.address)}"))
 
         def counted() -> Counted:
             of_process = {"kernel_drops": shell.kernel_drops(), "send_errors": shell.send_errors}
@@ -313,8 +358,9 @@ def _drive(
 
         def each_second() -> None:
             out.each_second()
-            if served:
-                served.take(counted().figures)
+            for shown in (served, page):
+                if shown:
+                    shown.take(counted().figures)
 
         run(
             [shell],

@@ -1,32 +1,26 @@
 """Over real UDP: openpi's unchanged client with both commands, and the Python interface."""
 
-import asyncio
 import json
 import re
 import socket
 import subprocess
 import sys
-import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager
 from pathlib import Path
 from queue import SimpleQueue
-from threading import Barrier, BrokenBarrierError
+from threading import Barrier, BrokenBarrierError, Thread
 from types import SimpleNamespace
 from typing import Any
 from urllib.request import urlopen
 
 import numpy as np
 import pytest
-from openpi_client import msgpack_numpy
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
-from websockets.asyncio.server import ServerConnection, serve
-from websockets.exceptions import ConnectionClosed
 
-from helpers import LOOPBACK, SKYTETHER, Idle, ran, refused
-from policy_lab import messages, process, ramp
+from helpers import LOOPBACK, Idle, ran, refused
+from policy_lab import PolicyServer, calls, command, joined, messages, process, served
 from skytether.__main__ import main
 from skytether.policy import PolicyError, Robot, values
 from skytether.policy.command import JoinOptions, _robot_options
@@ -36,74 +30,11 @@ from skytether.shared.base.errors import ConfigError
 from skytether.shell.driving.driver import Shell
 
 
-class PolicyServer:
-    """Policy server with openpi's protocol: metadata, then a reply to each observation."""
-
-    def __init__(self) -> None:
-        self.thinking_s = 0.0
-        self.seen: list[Any] = []
-        started = threading.Event()
-
-        async def handle(connection: ServerConnection) -> None:
-            packer = msgpack_numpy.Packer()
-            await connection.send(packer.pack({"name": "ramp"}))
-            try:
-                async for message in connection:
-                    self.seen.append(msgpack_numpy.unpackb(message))
-                    await asyncio.sleep(self.thinking_s)
-                    if "fail" in self.seen[-1]:
-                        await connection.send("Traceback:\nRuntimeError: no memory")
-                    else:
-                        await connection.send(packer.pack(ramp(self.seen[-1])))
-            except ConnectionClosed:
-                pass
-
-        async def run() -> None:
-            self._loop, self._end = asyncio.get_running_loop(), asyncio.Event()
-            async with serve(handle, "127.0.0.1", 0, compression=None, max_size=None) as server:
-                self.port = next(iter(server.sockets)).getsockname()[1]
-                started.set()
-                await self._end.wait()
-
-        self._thread = threading.Thread(target=lambda: asyncio.run(run()), daemon=True)
-        self._thread.start()
-        started.wait()
-
-    def close(self) -> None:
-        self._loop.call_soon_threadsafe(self._end.set)
-        self._thread.join()
-
-
 @pytest.fixture
 def policy() -> Iterator[PolicyServer]:
     server = PolicyServer()
     yield server
     server.close()
-
-
-def command(*argv: str) -> AbstractContextManager[str]:
-    return process(*SKYTETHER, *argv)
-
-
-def served(policy: PolicyServer, *flags: str) -> AbstractContextManager[str]:
-    upstream = f"ws://127.0.0.1:{policy.port}"
-    return command("policy", "serve", "--upstream", upstream, "--bind", "127.0.0.1:0", *flags)
-
-
-def joined(server: str, *flags: str) -> AbstractContextManager[str]:
-    line = ("--listen", "127.0.0.1:0", "--actions", "absolute", "--rows", "5", *flags)
-    return command("policy", "join", server, *line)
-
-
-def calls(client: WebsocketClientPolicy, count: int, period_s: float = 0.1) -> Sequence[float]:
-    """Make calls, execute five rows of each answer; returns the executed rows."""
-    position, rows = 0.0, list[float]()
-    for _ in range(count):
-        reply = client.infer({"state": np.array([position]), "prompt": "go on"})
-        rows += reply["actions"][:5, 0].tolist()
-        position = rows[-1] + 1.0
-        time.sleep(period_s)
-    return rows
 
 
 @pytest.mark.realtime
@@ -215,6 +146,7 @@ def test_the_documented_programs_run(tmp_path: Path) -> None:
         (["join", "127.0.0.1:1", "--actions", "delta", "--when", "never"], "needed(2)"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rows", "0"], "1 to 1024"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--listen", "0.0.0.0:1"], "--insecure"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--page", "0.0.0.0:1"], "--insecure"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--plays-on"], "--step"),
         (["serve", "--upstream", "http://127.0.0.1"], "ws://HOST:PORT"),
         (["serve", "--bind", "0.0.0.0:1"], "--keys"),
@@ -263,7 +195,7 @@ def function_line(infer: Any) -> tuple[Any, "SimpleQueue[bytes]"]:
     said: SimpleQueue[bytes] = SimpleQueue()
     loop: Any = SimpleNamespace(call_soon_threadsafe=lambda hear, each: hear(each))
     line = _FunctionLine(infer, {}, lambda each: said.put(each.payload))
-    threading.Thread(target=line._work, args=(loop,), daemon=True).start()
+    Thread(target=line._work, args=(loop,), daemon=True).start()
     return line, said
 
 
