@@ -55,7 +55,7 @@ def test_no_authentic_message_breaks_an_end(
     lab.connect()
     call(lab)
     for to_robot, forged in steps:
-        exchange = lab.robot._exchange
+        exchange = lab.robot._session.exchange
         assert exchange
         if len(forged) > 3:
             sent = [Report(exchange.session, *forged)]
@@ -70,7 +70,7 @@ def test_no_authentic_message_breaks_an_end(
         lab.sleep(0.05)
     json.dumps([lab.robot.figures(), lab.server.figures()], allow_nan=False)
     robot = lab.server._robots.get(1)
-    for exchange in (lab.robot._exchange, robot and robot.exchange):
+    for exchange in (lab.robot._session.exchange, robot and robot.exchange):
         if exchange:
             assert len(exchange._sent) <= REMEMBERED_MAX
             assert all(len(each._open) <= 4 for each in exchange._tallies.values())
