@@ -105,7 +105,8 @@ class JoinOptions(EndOptions):
     listen: str = "127.0.0.1:8000"
     """HOST:PORT to listen on for the robot program, which connects with openpi's client."""
     deadline: str = "150ms"
-    """Longest time from a call to its answer, except for the first call."""
+    """Longest time from a call to its answer, except for the first call and the first after a
+    pause."""
     hold: str = "1s"
     """Longest time for which calls are answered with the hold action; later calls get an error."""
     begin: str = "60s"

@@ -257,7 +257,9 @@ class Robot:
         self._line, self._on_event = _CallLine(), on_event
         self._shell = Shell(self._end, None, [at], line=self._line.open)
         self._lock = threading.Lock()
-        self._patience_s = max(deadline, options.begin_ns / SECOND_NS) + 5.0
+        self._patience_s = (
+            max(deadline, options.begin_ns / SECOND_NS, options.pause_ns / SECOND_NS) + 5.0
+        )
 
     def __enter__(self) -> Self:
         self._line.answers = queue.SimpleQueue()

@@ -10,8 +10,8 @@ protocol, or `Robot.infer`. A call is an observation. It is answered
   program must stop the robot.
 
 The first call of a program waits for its chunk for up to `begin_ns`, since the robot has not moved.
-So does a call after the program has executed all rows and then paused for more than `hold_ns` and
-PAUSE_NS, as between two episodes.
+The first call after the program has executed all rows and then made no call for more than
+`RobotOptions.pause_ns`, as between two episodes, waits for up to `pause_ns`.
 
 A frame of the local connection begins with a byte of `FrameType`.
 """
@@ -46,7 +46,7 @@ ASKED_MAX = 1024
 ROWS_SENT = 64
 """Largest number of next rows that are sent with an observation."""
 PAUSE_NS = SECOND_NS
-"""Shortest pause of the program after which a new episode is assumed [ns]."""
+"""Smallest value of `RobotOptions.pause_ns` [ns]."""
 
 
 class FrameType(bytes, Enum):
@@ -89,7 +89,7 @@ class RobotOptions:
     hold_ns: int = SECOND_NS
     """Longest time for which calls are answered with the hold action [ns]."""
     begin_ns: int = 60 * SECOND_NS
-    """Longest time to the answer of the first call, and of the first call after a pause [ns]."""
+    """Longest time from the first call to its answer [ns]."""
     key: str = "actions"
     """Key of the actions in the policy's reply."""
     step_ns: int | None = None
@@ -106,6 +106,13 @@ class RobotOptions:
     """Largest send rate [B/s]."""
     player: Callable[[], Player] = Clocked
     """Function that makes a player, the rule that chooses the row of each step."""
+
+    @property
+    def pause_ns(self) -> int:
+        """Time without a row or a call after which a new episode is assumed; its first call waits
+        for its chunk for as long [ns].
+        """
+        return max(self.hold_ns, PAUSE_NS)
 
 
 @dataclass(slots=True)
@@ -281,9 +288,11 @@ class RobotEnd(Endpoint):
         if not options.plays_on:
             schedule.stand(now_ns=now_ns)
         step = schedule.advance(now_ns=now_ns)
-        pause_ns = max(options.hold_ns, PAUSE_NS)
-        is_first = program.newest < 0 or schedule.has_paused(pause_ns, now_ns=now_ns)
-        answer_by_ns = now_ns + (options.begin_ns if is_first else options.deadline_ns)
+        has_paused = schedule.has_paused(options.pause_ns, now_ns=now_ns)
+        is_first, wait_ns = program.newest < 0 or has_paused, options.deadline_ns
+        if is_first:
+            wait_ns = options.begin_ns if program.newest < 0 else max(wait_ns, options.pause_ns)
+        answer_by_ns = now_ns + wait_ns
         number, stood_ns = schedule.number(now_ns=now_ns), schedule.stood_ns
         call = _Call(self._calls, now_ns, answer_by_ns, is_first, step, number, stood_ns)
         program.call = call

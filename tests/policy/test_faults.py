@@ -356,14 +356,14 @@ def test_of_two_programs_the_newest_is_the_robots() -> None:
 
 
 def test_a_program_that_pauses_plays_nothing_old_and_its_pause_is_no_step() -> None:
-    options = RobotOptions("absolute", 150 * MS, rows=5, begin_ns=2 * SECOND_NS)
+    options = RobotOptions("absolute", 150 * MS, rows=5)
     lab, position = flying(options=options)
     lab.is_cut = True
     lab.sleep(60)
     began_ns = lab.now_ns
     with pytest.raises(NoActionError):
         lab.infer(state(position))
-    assert lab.now_ns - began_ns == options.begin_ns
+    assert lab.now_ns - began_ns == options.pause_ns
     assert fly(lab, 1, position)[0] == [None]
     assert lab.robot.figures()["step_s"] <= 1.0
 

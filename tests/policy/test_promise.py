@@ -92,7 +92,7 @@ def test_the_promise(
         lab.is_cut = move.is_cut and call > 1
         lab.run(max(lab.now_ns, robot.until_ns))
         began_ns = lab.now_ns
-        is_first = call == 1 or began_ns - lab.answers[-1][0] > options.hold_ns
+        has_paused = bool(lab.answers) and began_ns - lab.answers[-1][0] > options.pause_ns
         asked[call] = began_ns, step
         lab.say(
             FrameType.MESSAGE.value + values.pack({"state": np.array([float(call), float(step)])})
@@ -100,7 +100,9 @@ def test_the_promise(
         robot.until_ns = lab.now_ns + move.frozen_call_ms * MS
         wait_for(lab, call + 1)
         answered_ns, said = lab.answers[-1]
-        limit_ns = options.begin_ns if is_first else options.deadline_ns
+        limit_ns = options.deadline_ns
+        if call == 1 or has_paused:
+            limit_ns = options.begin_ns if call == 1 else options.pause_ns
         assert answered_ns - began_ns <= max(limit_ns, move.frozen_call_ms * MS)
         rows: list[list[float]] = []
         if said[:1] == FrameType.MESSAGE:
@@ -162,9 +164,9 @@ def test_whatever_happens_each_call_gets_one_answer_by_its_deadline(
         assert lab.robot._program
         # A frozen robot end may not have seen yet that a new program has connected.
         is_first = lab.robot._program.newest < 0 or lab.now_ns < world.until_ns
-        if lab.answers:  # after a pause of the program a new episode may begin
-            is_first |= began_ns - lab.answers[-1][0] > options.hold_ns
         longest_ns = options.begin_ns if is_first else options.deadline_ns
+        if lab.answers and began_ns - lab.answers[-1][0] > options.pause_ns:
+            longest_ns = max(longest_ns, options.pause_ns)  # a new episode may begin
         limit_ns = max(began_ns, world.until_ns) + longest_ns + 1
         lab.run(limit_ns if calls else began_ns)
         answers = [each for each in lab.answers[before:] if not is_metadata(each[1])]
