@@ -77,27 +77,23 @@ class Player(ABC):
 
 
 class Clocked(Player):
-    """Player that executes the row of the present step of the newest chunk that has one."""
+    """Player that executes, at each step, the row of the newest chunk that has begun.
+
+    When this chunk ends, no row of an older chunk follows: a policy whose plan ends early stops.
+    """
 
     def accept(self, chunk: Held, step: int) -> None:
         if any(each.generation == chunk.generation for each in self.held):
             return  # a duplicate
-        left = [each for each in self.held if each.first + len(each.rows) > step]
-        if self.held and not left:
-            left = [self.held[0]]  # its last row may be repeated
-        newest_first = sorted([*left, chunk], key=lambda each: -each.generation)
-        self.held = tuple(newest_first[:HELD_MAX])
+        newest_first = sorted([*self.held, chunk], key=lambda each: -each.generation)
+        begun = next((i for i, each in enumerate(newest_first) if each.first <= step), HELD_MAX)
+        self.held = tuple(newest_first[: min(begun + 1, HELD_MAX)])
 
     def row(self, step: int) -> Row | None:
-        newest = None
         for _, first, rows in self.held:
-            if 0 <= step - first < len(rows):
-                self.last = rows[step - first]
-                return self.last
-            if newest is None and first <= step:
-                newest = rows
-        if newest is not None:
-            self.last = newest[-1]
+            if first <= step:
+                self.last = rows[min(step - first, len(rows) - 1)]
+                return self.last if step - first < len(rows) else None
         return None
 
 

@@ -469,7 +469,8 @@ def test_with_needed_a_program_gets_the_rows_that_it_executes() -> None:
 
 def test_rows_keep_their_fractions_when_the_policy_returns_whole_numbers_next() -> None:
     chunks = iter([np.arange(6)[:, None] + 0.5, np.array([[7], [8]])])
-    lab = Lab(lambda _: {"actions": next(chunks)}, RobotOptions("absolute", 150 * MS))
+    options = RobotOptions("absolute", 150 * MS, player=Freshest)
+    lab = Lab(lambda _: {"actions": next(chunks)}, options)
     lab.connect()
     got = []
     for _ in range(4):

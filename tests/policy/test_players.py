@@ -26,12 +26,13 @@ def test_the_row_of_the_present_step_is_played_whenever_the_chunk_arrives() -> N
     assert player.last[0] == 22.0
 
 
-def test_an_older_generation_fills_the_steps_for_which_the_newest_has_no_row() -> None:
-    """A chunk that arrives out of order adds rows only for steps without a newer row."""
+def test_an_older_chunk_is_executed_until_the_newest_begins_and_not_after_its_end() -> None:
     player = Clocked()
     player.accept(held(3, 2, 32.0), 0)
     player.accept(held(2, 0, 20.0, 21.0, 22.0, 23.0), 0)
-    assert played(player, range(5)) == [20.0, 21.0, 32.0, 23.0, None]
+    assert played(player, range(5)) == [20.0, 21.0, 32.0, None, None]
+    player.accept(held(4, 6, 46.0), 4)
+    assert played(player, range(4, 8)) == [None, None, 46.0, None]
 
 
 def test_a_single_action_that_comes_late_is_the_row_to_hold() -> None:
