@@ -14,7 +14,7 @@ from fuzz.mutators import bytes_changed, corpus, fields_changed
 from fuzz.target import Target
 from skytether.client.secure import SecureLink
 from skytether.policy import exchange, images, messages, parts, robot, schedule, serving, values
-from skytether.policy.images import Compressor, Unpacker
+from skytether.policy.images import Compressor
 from skytether.policy.robot import FrameType, RobotOptions
 from skytether.policy.virtual import ROBOT, SERVER, Emulated, NoActionError
 from skytether.server.secure import SecureGate
@@ -58,7 +58,7 @@ class RobotAndPolicy(Target):
             more["link"] = SecureLink(self._keyring.of(1), entropy=self._entropy)
             more["gate"] = SecureGate(self._keyring, entropy=self._entropy)
         self._link = more.get("link")
-        self._lab = Emulated(rows, OPTIONS, compress=Compressor(), unpacker=Unpacker, **more)
+        self._lab = Emulated(rows, OPTIONS, compress=Compressor(), **more)
         self._lab.on_datagram = self._note
         self._lab.connect()
         self._call()

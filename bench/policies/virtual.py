@@ -8,7 +8,7 @@ from bench.policies.tasks import TASKS, Policy, Task
 from skytether.gym import ORACLE, Chunk, Networked
 from skytether.gym.networked import Options
 from skytether.policy import values
-from skytether.policy.images import Compressor, Unpacker
+from skytether.policy.images import Compressor
 from skytether.policy.robot import RobotOptions
 from skytether.policy.virtual import Emulated
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
@@ -35,7 +35,6 @@ class Virtual:
             thinking=task.thinking_s,
             seed=seed,
             compress=Compressor(),
-            unpacker=Unpacker,
             gives_rows=gives_rows,
         )
         self._ends.connect()

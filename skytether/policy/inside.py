@@ -12,7 +12,7 @@ from typing import Any, Self
 
 from skytether.client.link import ClientLink, PlainLink
 from skytether.policy import values
-from skytether.policy.images import QUALITY, Compressor, Unpacker
+from skytether.policy.images import QUALITY, Compressor
 from skytether.policy.robot import LINE, FrameType, RobotEnd, RobotOptions
 from skytether.policy.schedule import Actions
 from skytether.policy.serving import PolicyEnd, reply_of
@@ -59,7 +59,6 @@ def policy_end(gate: Gate, **options: Any) -> PolicyEnd:
         gate,
         boot_id=secrets.randbits(63),
         draw=lambda: secrets.randbits(32),
-        unpacker=Unpacker,
         **options,
     )
 

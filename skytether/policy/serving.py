@@ -17,6 +17,7 @@ import numpy as np
 from skytether.policy import events, values
 from skytether.policy.committed import RobotRows, UnderWay
 from skytether.policy.exchange import Exchange
+from skytether.policy.images import Unpacker
 from skytether.policy.messages import (
     CHUNK,
     METADATA,
@@ -128,8 +129,6 @@ class PolicyEnd(Endpoint):
             (the rows that the robot will execute from the observation's step on) and `committed`
             (the first d of them), see module `committed`.
         rate_max: largest send rate to each robot [B/s].
-        unpacker: makes the hook that decompresses the images of one observation, see
-            `images.Unpacker`; None: images are not compressed.
     """
 
     def __init__(
@@ -141,12 +140,10 @@ class PolicyEnd(Endpoint):
         patience_ns: int = 30 * SECOND_NS,
         gives_rows: bool = False,
         rate_max: float = RATE_MAX,
-        unpacker: Callable[[], Callable[[dict[Any, Any]], Any]] | None = None,
     ) -> None:
         super().__init__()
         self._gate, self._boot_id, self._draw = gate, boot_id, draw
         self._patience_ns, self._gives_rows, self._rate_max = patience_ns, gives_rows, rate_max
-        self._unpacker = unpacker
         self._robots: dict[int, _Robot] = {}
         self._welcomed: dict[int, _Robot] = {}
         """Robots by number that have sent only a HELLO; the HELLO may be a replay."""
@@ -344,7 +341,7 @@ class PolicyEnd(Endpoint):
             robot.exchange.send(CHUNK, robot.answered[1], is_urgent=True)
             return
         try:
-            observation = values.unpack(seen, self._unpacker and self._unpacker())
+            observation = values.unpack(seen, Unpacker())
         except ValueRefused:
             raise ProtocolError(Drop.FIELD) from None
         self._counts["observations"] += 1

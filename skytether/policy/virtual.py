@@ -51,7 +51,7 @@ class Emulated:
         seed: random seed of the network.
         metadata: metadata that the policy sends when it is connected.
         link, gate: encryption at the robot end and at the policy end; None: plaintext.
-        compress, unpacker: compression of images, see `images`.
+        compress: compression of images, see `images.Compressor`.
         gives_rows: see `PolicyEnd`.
         boot_ids: run numbers of robot end and policy end.
 
@@ -72,7 +72,6 @@ class Emulated:
         link: ClientLink | None = None,
         gate: Gate | None = None,
         compress: Callable[[Any], Any] = lambda observation: observation,
-        unpacker: Callable[[], Callable[[dict[Any, Any]], Any]] | None = None,
         gives_rows: bool = False,
         boot_ids: tuple[int, int] = (1, 2),
     ) -> None:
@@ -86,7 +85,6 @@ class Emulated:
             boot_id=boot_ids[1],
             draw=lambda: next(sessions),
             gives_rows=gives_rows,
-            unpacker=unpacker,
         )
         self.now_ns = 0
         self.answers: list[tuple[int, bytes]] = []

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from policy_lab import MS, OPTIONS, Lab, first_row, keyed, ramp, secured, state
 from skytether.policy import events, values
-from skytether.policy.images import Compressor, Unpacker
+from skytether.policy.images import Compressor
 from skytether.policy.players import Clocked, Freshest, Queue
 from skytether.policy.robot import LINE, FrameType, RobotOptions
 from skytether.policy.schedule import Kind, Schedule
@@ -280,7 +280,7 @@ def test_a_policy_end_restarted_with_other_options_gives_rows() -> None:
 
 
 def test_images_and_their_bytes() -> None:
-    lab = Lab(ramp, compress=Compressor(64), unpacker=Unpacker)
+    lab = Lab(ramp, compress=Compressor(64))
     lab.connect()
     image = np.zeros((240, 320, 3), np.uint8)
     lab.infer(state(0.0) | {"camera": image})

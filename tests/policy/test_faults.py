@@ -22,7 +22,7 @@ from policy_lab import (
 from skytether.client.secure import SecureLink
 from skytether.policy import events, metrics, values
 from skytether.policy.exchange import Exchange
-from skytether.policy.images import Compressor, Unpacker
+from skytether.policy.images import Compressor
 from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
 from skytether.policy.robot import FrameType, RobotEnd, RobotOptions
 from skytether.policy.serving import PolicyEnd
@@ -295,7 +295,7 @@ def test_a_reply_that_is_nested_deep_is_an_error_at_most(depth: int) -> None:
 
 def test_a_camera_that_stops() -> None:
     """Observations without its image reach the policy, and are answered."""
-    lab = Lab(ramp, compress=Compressor(64), unpacker=Unpacker, **FAR)
+    lab = Lab(ramp, compress=Compressor(64), **FAR)
     lab.connect()
     image = np.zeros((240, 320, 3), np.uint8)
     for position, cameras in enumerate([{"wrist": image, "top": image}, {"wrist": image}, {}] * 3):
@@ -306,7 +306,7 @@ def test_a_camera_that_stops() -> None:
 
 def test_observations_of_20_mb() -> None:
     """Large images are resized and sent; a large array is refused with its size."""
-    lab = Lab(ramp, compress=Compressor(224), unpacker=Unpacker, **FAR)
+    lab = Lab(ramp, compress=Compressor(224), **FAR)
     lab.connect()
     image = np.zeros((1700, 1960, 3), np.uint8)
     lab.infer(state(0.0) | {"wrist": image, "top": image})
@@ -318,7 +318,7 @@ def test_observations_of_20_mb() -> None:
 
 
 def test_an_observation_that_is_nested_deep_is_an_error_at_once() -> None:
-    lab = Lab(ramp, compress=Compressor(32), unpacker=Unpacker)
+    lab = Lab(ramp, compress=Compressor(32))
     lab.connect()
     lab.infer(state(0.0))
     lab.say(FrameType.MESSAGE.value + b"\x81\xa1a" * 900 + b"\xc0")
