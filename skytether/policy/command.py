@@ -271,12 +271,13 @@ def _shown(address: Address, options: JoinOptions) -> Iterator["CallPage"]:
     from skytether.policy.page import CallPage
     from skytether.shell.processes.exporter import MetricsError
 
+    chosen = _robot_options(options)
     about = {
         "robot": options.robot,
         "server": options.server or ", ".join(options.path),
         "actions": options.actions,
-        "deadline_ms": _time_ns("--deadline", options.deadline) / MILLISECOND_NS,
-        "hold_ms": _time_ns("--hold", options.hold) / MILLISECOND_NS,
+        "deadline_ms": chosen.deadline_ns / MILLISECOND_NS,
+        "hold_ms": chosen.hold_ns / MILLISECOND_NS,
     }
     try:
         page = CallPage(address, about)

@@ -155,7 +155,7 @@ def test_calls_are_answered_while_browsers_do_not_read(policy: PolicyServer) -> 
     host, port = free_address()
     with (
         served(policy) as server,
-        joined(server, "--deadline", "2s", "--page", f"{host}:{port}") as robot,
+        joined(server, "--deadline", "2s", "--hold", "0s", "--page", f"{host}:{port}") as robot,
         ExitStack() as stack,
     ):
         client = WebsocketClientPolicy(f"ws://{robot}")
