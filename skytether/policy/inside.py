@@ -316,8 +316,25 @@ class Robot:
             raise PolicyError(answer[1:].decode())
         return values.unpack(answer[1:])
 
+    def reset(self) -> None:
+        """Begin an episode: no row of an earlier chunk is executed, and the next call waits for
+        the policy's chunk, as the first call does.
+        """
+        self._do(self._begin)
+        self._is_connected, self._unread = False, 0
+
+    def _begin(self) -> None:
+        assert self._line
+        self._line.answers = queue.SimpleQueue()  # without answers to interrupted calls
+        self._line.hear(Datagram(FrameType.OPENED.value, PEER, LINE))
+
     def figures(self) -> dict[str, Any]:
         """Counters, as `skytether policy join --json` writes them."""
-        done: Future[dict[str, Any]] = Future()
-        self._loop.call_soon_threadsafe(lambda: done.set_result(self._end.figures()))
+        figures: dict[str, Any] = self._do(self._end.figures)
+        return figures
+
+    def _do(self, function: Callable[[], Any]) -> Any:
+        """Result of a function, called in the thread of the event loop."""
+        done: Future[Any] = Future()
+        self._loop.call_soon_threadsafe(lambda: done.set_result(function()))
         return done.result()
