@@ -117,7 +117,8 @@ def measured(trial: Trial, who: str, seed: int | None) -> list[float]:
             network, to=("127.0.0.1", port), seed=seed or 0, tcp=who == OWN
         ) as relay,
     ):
-        robot = trial.run(who, "{}:{}".format(*relay.address))
+        more = () if who == OWN else ("--policy.hold=2",)
+        robot = trial.run(who, "{}:{}".format(*relay.address), *more)
         first_s = trial.first_s()
         for after_s, impairments in (
             (OUTAGE_AT_S, outage),
