@@ -96,14 +96,16 @@ class Trial:
         robot = ("--robot.type=recorded", f"--robot.file={self.actions}", f"--fps={FPS}")
         return self.start(*argv, *robot)
 
-    def first_s(self) -> float:
+    def first_s(self, robot: "subprocess.Popen[bytes]") -> float:
         """Time of the first action, as soon as it is recorded."""
-        while not (self.actions.exists() and self.actions.read_text().count("\n")):
+        while not (self.actions.exists() and self.actions.read_text()):
+            assert robot.poll() is None, self.log.read_text()
             time.sleep(0.01)
         return self.recorded()[0].time_s
 
     def recorded(self) -> list[Action]:
-        rows = [[float(each) for each in line.split()] for line in self.actions.open()]
+        lines = self.actions.read_text().splitlines()
+        rows = [[float(each) for each in line.split()] for line in lines]
         return [Action(time_s, tuple(joints)) for time_s, *joints in rows]
 
 
@@ -119,7 +121,7 @@ def measured(trial: Trial, who: str, seed: int | None) -> list[float]:
     ):
         more = () if who == OWN else ("--policy.hold=2",)
         robot = trial.run(who, "{}:{}".format(*relay.address), *more)
-        first_s = trial.first_s()
+        first_s = trial.first_s(robot)
         for after_s, impairments in (
             (OUTAGE_AT_S, outage),
             (OUTAGE_AT_S + OUTAGE_S, network),

@@ -143,7 +143,7 @@ class TestWithLerobot:
             skytether.bad_network("constant(20ms)", to=("127.0.0.1", port)) as network,
         ):
             robot = trial.run(PLUGIN, "{}:{}".format(*network.address))
-            trial.first_s()
+            trial.first_s(robot)
             network.set("loss(100%)")
             assert robot.wait() == 1
         assert "PolicyError: no action from the policy" in trial.log.read_text()
