@@ -58,7 +58,8 @@ class Trial:
 
     def start(self, *argv: str) -> "subprocess.Popen[bytes]":
         with self.log.open("a") as log:
-            return subprocess.Popen(argv, env=self._environment, stdout=log, stderr=log)
+            folder = self.log.parent  # LeRobot writes a folder `logs` where it runs
+            return subprocess.Popen(argv, env=self._environment, cwd=folder, stdout=log, stderr=log)
 
     @contextmanager
     def served(self, who: str, port: int) -> Iterator[None]:
