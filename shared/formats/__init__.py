@@ -1,15 +1,16 @@
-"""Files of other programs: tracks, zones and recorded links.
+"""Files of other programs: tracks, zones, recorded links, and recordings for Foxglove.
 
     skyc, kml, tables, plan, waypoints, ulog, dataflash, gpx  tracks of vehicles, one module each
     tracks, timing         tracks for a scenario: one clock, or a speed where a file has no times
     shapes                 `csv`, `mission` and `show`, in the table REFERENCES
     zones                  `geojson`, `kml` and `plan`, in the table ZONES; `zone_files`, `plans`
     recorded, pings        recorded links, for `trace` of netem and for the probe
+    foxglove               MCAP files with messages that Foxglove draws
     bounded, geographic    files read within bounds; coordinates of the globe
 
 Each module for a format of tracks is a `Format`. It is imported when a file of that format is read.
 The package imports `shared.missions`, `shared.scenario`, `shared.law` and `shared.base`; ULog needs
-the extra `ulog`.
+the extra `ulog`, and `foxglove` the extra `record`.
 """
 
 from collections.abc import Callable

@@ -13,21 +13,21 @@ import queue
 import threading
 import time
 from base64 import b64encode
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
-from mcap.writer import Writer
+from numpy.typing import NDArray
 
 from skytether.policy.images import JPEG, is_image
 from skytether.policy.robot import AnsweredCall
 from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Event
+from skytether.shared.formats import foxglove
 
 VALUES_MAX = 256
 """Largest number of elements of an array in `/observation`; of a larger one the shape is given."""
@@ -40,41 +40,11 @@ FLUSH_S, CHUNK_BYTES = 0.25, 16 * 1024
 loses the last chunk."""
 CLOSING_S = 5.0
 """Longest time to wait for the disk at the end [s]."""
-INFO = 2
-_TIME = {"type": "object", "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}}}
-_BYTES = {"type": "string", "contentEncoding": "base64"}
-_SCHEMAS: dict[str, dict[str, Any]] = {
-    "foxglove.CompressedImage": {
-        "timestamp": _TIME,
-        "frame_id": {"type": "string"},
-        "data": _BYTES,
-        "format": {"type": "string"},
-    },
-    "foxglove.RawImage": {
-        "timestamp": _TIME,
-        "frame_id": {"type": "string"},
-        "width": {"type": "integer"},
-        "height": {"type": "integer"},
-        "encoding": {"type": "string"},
-        "step": {"type": "integer"},
-        "data": _BYTES,
-    },
-    "foxglove.Log": {
-        "timestamp": _TIME,
-        "level": {"type": "integer"},
-        "message": {"type": "string"},
-        "name": {"type": "string"},
-        "file": {"type": "string"},
-        "line": {"type": "integer"},
-    },
-    "skytether.Answer": {
-        "call": {"type": "integer"},
-        "kind": {"type": "string"},
-        "waited_s": {"type": "number"},
-        "chunk_age_s": {"type": "number"},
-        "left": {"type": "integer"},
-    },
-    "skytether.Observation": {},
+_ANSWER = {"call": "integer", "kind": "string", "waited_s": "number"}
+_ANSWER |= {"chunk_age_s": "number", "left": "integer"}
+SCHEMAS = {
+    name: {"type": "object", "properties": {key: {"type": each} for key, each in fields.items()}}
+    for name, fields in {"skytether.Answer": _ANSWER, "skytether.Observation": {}}.items()
 }
 
 
@@ -91,12 +61,9 @@ class CallRecording:
 
     def __init__(self, path: Path, key: str) -> None:
         self._growing, self._key = files.Growing(path), key
-        self._writer = Writer(self._growing.file, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
-        self._writer.start(profile="", library="skytether")
-        self._channels: dict[tuple[str, str], int] = {}
+        self._channels = foxglove.Channels(self._growing.file, "skytether", CHUNK_BYTES)
         self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(WAITING_MAX)
         self._offset_ns = time.time_ns() - time.monotonic_ns()
-        self._now_ns = 0
         self._missed = 0
         self._fault = ""
         self._thread = threading.Thread(target=self._work, daemon=True)
@@ -118,7 +85,7 @@ class CallRecording:
         if self._thread.is_alive():
             return f"{self._growing.at}: the disk has not taken the end within {CLOSING_S:g} s"
         try:
-            self._growing.end(empty=not self._channels, whole=not self._fault)
+            self._growing.end(empty=not self._channels.numbers, whole=not self._fault)
         except OSError as error:
             self._fault = f"cannot be completed: {error.strerror}"
         if self._missed and not self._fault:
@@ -144,24 +111,27 @@ class CallRecording:
                 if time.monotonic() - flushed_s >= FLUSH_S:
                     self._growing.file.flush()
                     flushed_s = time.monotonic()
-            self._writer.finish()
+            self._channels.writer.finish()
         except Exception as error:  # whatever it is, `close` must not wait for this thread
             self._fault = f"cannot be written: {error}"
             for _ in actions:
                 pass
 
     def _add_call(self, call: AnsweredCall) -> None:
-        self._now_ns = call.time_ns - call.waited_ns + self._offset_ns
+        self._channels.now_ns = call.time_ns - call.waited_ns + self._offset_ns
         numbers = dict[str, Any]()
         for name, value in _leaves(call.sent, ""):
-            if image := _image(value):
-                schema, content = image
-                self._add_drawn(f"/images/{name}", schema, {"frame_id": name, **content})
+            if isinstance(value, dict):
+                data = b64encode(value[JPEG]).decode()
+                image = {"frame_id": name, "data": data, "format": "jpeg"}
+                self._channels.draw(f"/images/{name}", "CompressedImage", image)
+            elif is_image(value):
+                self._channels.draw(f"/images/{name}", "RawImage", _raw_image(name, value))
             else:
                 numbers[name] = _small(value)
         if call.sent is not None:
-            self._add("/observation", "skytether.Observation", numbers | {"call": call.number})
-        self._now_ns = call.time_ns + self._offset_ns
+            self._add("/observation", "Observation", numbers | {"call": call.number})
+        self._channels.now_ns = call.time_ns + self._offset_ns
         rows = call.reply.get(self._key) if isinstance(call.reply, dict) else None
         answer = {
             "call": call.number,
@@ -171,25 +141,16 @@ class CallRecording:
             "left": call.left,
             "actions": _small(rows, ACTIONS_MAX),
         }
-        self._add("/answers", "skytether.Answer", answer)
+        self._add("/answers", "Answer", answer)
 
     def _add_event(self, now_ns: int, sentence: str) -> None:
-        self._now_ns = now_ns + self._offset_ns
-        log = {"level": INFO, "message": sentence, "name": "policy join", "file": "", "line": 0}
-        self._add_drawn("/events", "foxglove.Log", log)
+        self._channels.now_ns = now_ns + self._offset_ns
+        log = foxglove.log("policy join", sentence, foxglove.INFO)
+        self._channels.draw("/events", "Log", log)
 
-    def _add_drawn(self, topic: str, schema: str, content: Mapping[str, Any]) -> None:
-        sec, nsec = divmod(self._now_ns, SECOND_NS)
-        self._add(topic, schema, {"timestamp": {"sec": sec, "nsec": nsec}, **content})
-
-    def _add(self, topic: str, schema: str, content: Mapping[str, Any]) -> None:
-        if (topic, schema) not in self._channels:
-            table = {"title": schema, "type": "object", "properties": _SCHEMAS[schema]}
-            number = self._writer.register_schema(schema, "jsonschema", msgspec.json.encode(table))
-            channel = self._writer.register_channel(topic, "json", number)
-            self._channels[topic, schema] = channel
-        data = msgspec.json.encode(content)
-        self._writer.add_message(self._channels[topic, schema], self._now_ns, data, self._now_ns)
+    def _add(self, topic: str, kind: str, message: dict[str, Any]) -> None:
+        name = f"skytether.{kind}"
+        self._channels.put(topic, name, SCHEMAS[name], message)
 
 
 def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
@@ -204,16 +165,11 @@ def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
         yield key, value
 
 
-def _image(value: Any) -> tuple[str, dict[str, Any]] | None:
-    """Schema and content of an image's message; None if the value is not an image."""
-    if isinstance(value, dict):
-        data = b64encode(value[JPEG]).decode()
-        return "foxglove.CompressedImage", {"data": data, "format": "jpeg"}
-    if not is_image(value):
-        return None
+def _raw_image(name: str, value: NDArray[Any]) -> dict[str, Any]:
     pixels = value if value.shape[2] == 3 else value.transpose(1, 2, 0)
     height, width = pixels.shape[:2]
-    return "foxglove.RawImage", {
+    return {
+        "frame_id": name,
         "width": width,
         "height": height,
         "encoding": "rgb8",

@@ -60,7 +60,7 @@ def test_a_full_disk_stops_the_recording_alone(
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(written._writer, "add_message", full)
+    monkeypatch.setattr(written._channels.writer, "add_message", full)
     for number in range(2 * recording.WAITING_MAX):
         written.note(answered(number))
     assert "No space left on device" in written.close()

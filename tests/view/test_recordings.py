@@ -518,7 +518,7 @@ def test_without_its_checksum_a_changed_number_would_be_believed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(
-        "skytether.view.recordings.recording.Writer",
+        "skytether.shared.formats.foxglove.Writer",
         partial(Writer, compression=CompressionType.NONE),
     )
     path = record(tmp_path / "it.mcap")

@@ -5,7 +5,6 @@
     joining    merges recordings of one flight's processes
     export     tables, CSV or Parquet
     traffic    netem's packets as delay traces and as a pcap capture
-    foxglove   messages that Foxglove draws
     outcome    sentences about what happened
     report     an HTML page with figures
 

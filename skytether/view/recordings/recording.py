@@ -28,7 +28,6 @@ from typing import Any, BinaryIO
 
 import msgspec
 import numpy as np
-from mcap.writer import Writer
 
 from skytether.shared.events.flight import (
     ChangeRefused,
@@ -38,6 +37,7 @@ from skytether.shared.events.flight import (
     Fault,
     RecordIncomplete,
 )
+from skytether.shared.formats import foxglove
 from skytether.shared.law.model import Array
 from skytether.shared.scenario.reading import to_toml
 from skytether.shared.scenario.whole import Scenario
@@ -46,7 +46,6 @@ from skytether.shared.telemetry.feed import Figures, Frame, Opened, Rows, Said, 
 from skytether.shared.telemetry.record import Rows as Table
 from skytether.shared.telemetry.summary import Summary
 from skytether.view import rows
-from skytether.view.recordings import foxglove
 from skytether.view.recordings.container import COPY, COPY_OF, ENCODING
 
 BEGUN, FEED = "/recording", "/feed/"
@@ -98,15 +97,12 @@ class Recording:
     """
 
     def __init__(self, file: BinaryIO, scenario: Scenario, about: About) -> None:
-        self._writer = Writer(file, chunk_size=CHUNK_BYTES, enable_data_crcs=True)
-        self._writer.start(profile="", library=f"{OURS} {about.version}")
+        self._channels = foxglove.Channels(file, f"{OURS} {about.version}", CHUNK_BYTES)
+        self._writer = self._channels.writer
         self._scenario = scenario
         self._offset_ns = about.offset_ns
         self._tables: dict[tuple[str, str], rows.RowTable] = {}
-        self._channels: dict[str, int] = {}
-        self._schemas: dict[bytes, int] = {}
         self._shown: set[int] = set()
-        self._now_ns = 0
         toml = to_toml(scenario)
         begun = Begun(about=about, scenario=toml.decode())
         self._add_twice(BEGUN, msgspec.msgpack.encode(begun))
@@ -121,12 +117,12 @@ class Recording:
         Raises:
             ValueError: the rows do not match the columns that the process announced.
         """
-        self._now_ns = max(0, frame.time_ns + self._offset_ns)
+        self._channels.now_ns = max(0, frame.time_ns + self._offset_ns)
         match frame:
             case Opened():
                 for part, columns in frame.parts.items():
                     self._tables[process, part] = rows.RowTable(columns_of(columns))
-                if f"{FEED}{process}" in self._channels:
+                if (f"{FEED}{process}", "") in self._channels.numbers:
                     self._add_frame(process, frame)
                 else:
                     self._add_twice(f"{FEED}{process}", feed.pack(frame))
@@ -135,7 +131,9 @@ class Recording:
                 self._say(process, frame.event)
             case Figures(figures=figures):
                 self._add_frame(process, frame)
-                self._put(f"/figures/{process}", "skytether.Figures", _schema_of(figures), figures)
+                self._channels.put(
+                    f"/figures/{process}", "skytether.Figures", _schema_of(figures), figures
+                )
             case Rows():
                 table = self._tables.get((process, frame.part))
                 if table is None:
@@ -156,82 +154,64 @@ class Recording:
         self._writer.flush()
 
     def _attach(self, name: str, kind: str, content: bytes) -> None:
-        self._writer.add_attachment(0, self._now_ns, name, kind, content)
+        self._writer.add_attachment(0, self._channels.now_ns, name, kind, content)
 
     def _add_frame(self, process: str, frame: Frame) -> None:
         """Add a frame unchanged, to be read by `recorded`."""
-        self._add(f"{FEED}{process}", ENCODING, 0, feed.pack(frame))
+        self._channels.add(f"{FEED}{process}", ENCODING, feed.pack(frame))
 
     def _add_twice(self, topic: str, content: bytes) -> None:
         """Add the first message of a topic, without which the topic is unreadable, and its copy."""
         self.flush()
-        self._add(topic, ENCODING, 0, content)
+        self._channels.add(topic, ENCODING, content)
         self.flush()
-        original = {COPY_OF: str(self._channels[topic])}
+        original = {COPY_OF: str(self._channels.numbers[topic, ""])}
         copy = self._writer.register_channel(f"{COPY}{topic}", ENCODING, 0, original)
-        self._writer.add_message(copy, self._now_ns, content, self._now_ns)
+        now_ns = self._channels.now_ns
+        self._writer.add_message(copy, now_ns, content, now_ns)
         self.flush()
 
     def _say(self, process: str, event: Event) -> None:
-        self._put("/said", "skytether.Said", _SAID, {"process": process, "event": event})
+        self._channels.put("/said", "skytether.Said", _SAID, {"process": process, "event": event})
         level = foxglove.WARNING if isinstance(event, WARNINGS) else foxglove.INFO
-        self._draw("/events", "Log", foxglove.log(self._now_ns, process, str(event), level))
+        self._channels.draw("/events", "Log", foxglove.log(process, str(event), level))
 
     def _put_rows(self, part: str, table: rows.RowTable, made: Table) -> None:
         """For each row, add a message for other programs, and messages that draw the row."""
         for row, message in zip(made, table.messages(made), strict=True):
             number = int(row["vehicle"]) if "vehicle" in table.names else 0
             at = f"/vehicle/{number}/{_TOPICS.get(part, part)}" if number else f"/{part}/packets"
-            self._put(at, f"skytether.{part}", table.schema, message)
+            self._channels.put(at, f"skytether.{part}", table.schema, message)
             if 0 < number <= VEHICLES_MAX:
                 self._draw_row(part, number, row)
 
     def _draw_row(self, part: str, number: int, row: np.void) -> None:
-        at, name, now_ns = f"/vehicle/{number}", f"vehicle {number}", self._now_ns
+        at, name = f"/vehicle/{number}", f"vehicle {number}"
+        channels, now_ns = self._channels, self._channels.now_ns
         match part:
             case "client":
                 state = row["state"]
                 if not np.isfinite(state).all():
                     return
-                self._draw(f"{at}/pose", "PoseInFrame", foxglove.pose_in_frame(now_ns, state))
-                moved = foxglove.transform(now_ns, name, state)
-                self._draw(f"{at}/transform", "FrameTransform", moved)
+                channels.draw(f"{at}/pose", "PoseInFrame", foxglove.pose_in_frame(state))
+                moved = foxglove.transform(name, state)
+                channels.draw(f"{at}/transform", "FrameTransform", moved)
                 drawn = foxglove.vehicle(now_ns, name, state)
-                self._draw(f"{at}/scene/vehicle", "SceneUpdate", drawn)
+                channels.draw(f"{at}/scene/vehicle", "SceneUpdate", drawn)
             case "server":
                 if np.isfinite(row["reference"]).all():
                     drawn = foxglove.point(now_ns, f"{name}: reference", row["reference"])
-                    self._draw(f"{at}/scene/reference", "SceneUpdate", drawn)
+                    channels.draw(f"{at}/scene/reference", "SceneUpdate", drawn)
                 if number not in self._shown:
                     self._shown.add(number)
                     path = trajectory(self._scenario)
                     drawn = foxglove.line(now_ns, f"{name}: trajectory", path, foxglove.GREY)
-                    self._draw(f"{at}/scene/trajectory", "SceneUpdate", drawn)
+                    channels.draw(f"{at}/scene/trajectory", "SceneUpdate", drawn)
             case "plan":
                 path = rows.planned(self._scenario, row)
                 if np.isfinite(path).all():
                     drawn = foxglove.line(now_ns, f"{name}: plan", path, foxglove.GREEN)
-                    self._draw(f"{at}/scene/plan", "SceneUpdate", drawn)
-
-    def _draw(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
-        name = f"foxglove.{kind}"
-        self._put(topic, name, foxglove.SCHEMAS[name], message)
-
-    def _put(self, topic: str, name: str, schema: Mapping[str, Any], message: Any) -> None:
-        number = 0
-        if topic not in self._channels:
-            encoded = msgspec.json.encode({"title": name, **schema})
-            if encoded not in self._schemas:
-                self._schemas[encoded] = self._writer.register_schema(name, "jsonschema", encoded)
-            number = self._schemas[encoded]
-        self._add(topic, "json", number, msgspec.json.encode(message))
-
-    def _add(self, topic: str, encoding: str, schema: int, content: bytes) -> None:
-        """Add a message; writes the topic's channel before its first message."""
-        if topic not in self._channels:
-            channel = self._writer.register_channel(topic, encoding, schema)
-            self._channels[topic] = channel
-        self._writer.add_message(self._channels[topic], self._now_ns, content, self._now_ns)
+                    channels.draw(f"{at}/scene/plan", "SceneUpdate", drawn)
 
 
 def _text(value: str | int) -> str:

@@ -1,12 +1,16 @@
-"""Messages for drawings in Foxglove and Lichtblick, and their JSON schemas.
+"""MCAP files for Foxglove and Lichtblick: messages that both programs draw, and their JSON schemas.
 
 All positions are in the frame WORLD: metres, third axis up. The schemas use only objects, lists and
-single types, and no nested lists, because both programs support no more.
+single types, and no nested lists, because both programs support no more. The module needs the extra
+`record`.
 """
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, BinaryIO
+
+import msgspec
+from mcap.writer import Writer
 
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.law.model import Array
@@ -27,6 +31,7 @@ def _several(items: Json) -> Json:
 
 _NUMBER, _WHOLE = {"type": "number"}, {"type": "integer"}
 _TEXT, _FLAG = {"type": "string"}, {"type": "boolean"}
+_BYTES = {"type": "string", "contentEncoding": "base64"}
 _TIME = _object(sec=_WHOLE, nsec=_WHOLE)
 _VECTOR = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER)
 _QUATERNION = _object(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
@@ -81,6 +86,16 @@ SCHEMAS: Mapping[str, Json] = {
     "foxglove.Log": _object(
         timestamp=_TIME, level=_WHOLE, message=_TEXT, name=_TEXT, file=_TEXT, line=_WHOLE
     ),
+    "foxglove.CompressedImage": _object(timestamp=_TIME, frame_id=_TEXT, data=_BYTES, format=_TEXT),
+    "foxglove.RawImage": _object(
+        timestamp=_TIME,
+        frame_id=_TEXT,
+        width=_WHOLE,
+        height=_WHOLE,
+        encoding=_TEXT,
+        step=_WHOLE,
+        data=_BYTES,
+    ),
 }
 
 VEHICLE_M, POINT_M, LINE_M = 0.12, 0.09, 0.015
@@ -92,31 +107,68 @@ BLUE, RED, GREY, GREEN = (
 """Colours of a vehicle, of its desired position, of the trajectory, and of a plan."""
 
 
-def log(time_ns: int, process: str, message: str, level: int) -> Json:
-    return {
-        "timestamp": _time(time_ns),
-        "level": level,
-        "message": message,
-        "name": process,
-        "file": "",
-        "line": 0,
-    }
+class Channels:
+    """Channels of an MCAP file; a channel and its schema are written before its first message.
+
+    Args:
+        library: name of the writing library.
+        chunk_bytes: size of a chunk [B].
+    """
+
+    def __init__(self, file: BinaryIO, library: str, chunk_bytes: int) -> None:
+        self.writer = Writer(file, chunk_size=chunk_bytes, enable_data_crcs=True)
+        self.writer.start(profile="", library=library)
+        self.now_ns = 0
+        """Time of the next messages [ns]."""
+        self.numbers: dict[tuple[str, str], int] = {}
+        """Number of each channel, by topic and name of its schema."""
+        self._schemas: dict[bytes, int] = {}
+
+    def draw(self, topic: str, kind: str, message: Mapping[str, Any]) -> None:
+        """Add a message foxglove.KIND, with its timestamp."""
+        schema = SCHEMAS[f"foxglove.{kind}"]
+        if "timestamp" in schema["properties"]:
+            message = {"timestamp": _time(self.now_ns), **message}
+        self.put(topic, f"foxglove.{kind}", schema, message)
+
+    def put(self, topic: str, name: str, schema: Mapping[str, Any], message: Any) -> None:
+        """Add a message as JSON; `name` is the name of its schema."""
+        number = 0
+        if (topic, name) not in self.numbers:
+            encoded = msgspec.json.encode({"title": name, **schema})
+            if encoded not in self._schemas:
+                number = self.writer.register_schema(name, "jsonschema", encoded)
+                self._schemas[encoded] = number
+            number = self._schemas[encoded]
+        self.add(topic, "json", msgspec.json.encode(message), name, number)
+
+    def add(
+        self, topic: str, encoding: str, content: bytes, name: str = "", schema: int = 0
+    ) -> None:
+        """Add an encoded message; `schema` is the number of its schema, 0 if it has none."""
+        if (topic, name) not in self.numbers:
+            number = self.writer.register_channel(topic, encoding, schema)
+            self.numbers[topic, name] = number
+        self.writer.add_message(self.numbers[topic, name], self.now_ns, content, self.now_ns)
 
 
-def pose_in_frame(time_ns: int, state: Array) -> Json:
+def log(process: str, message: str, level: int) -> Json:
+    return {"level": level, "message": message, "name": process, "file": "", "line": 0}
+
+
+def pose_in_frame(state: Array) -> Json:
     """Message foxglove.PoseInFrame: a vehicle, heading in its direction of motion.
 
     Args:
         state: position [m] and velocity [m/s]; shape (axes, 2).
     """
-    return {"timestamp": _time(time_ns), "frame_id": WORLD, "pose": _pose(state)}
+    return {"frame_id": WORLD, "pose": _pose(state)}
 
 
-def transform(time_ns: int, vehicle: str, state: Array) -> Json:
+def transform(vehicle: str, state: Array) -> Json:
     """Message foxglove.FrameTransform: the frame of a vehicle, which a 3D view can follow."""
     pose = _pose(state)
     return {
-        "timestamp": _time(time_ns),
         "parent_frame_id": WORLD,
         "child_frame_id": vehicle,
         "translation": pose["position"],
