@@ -15,7 +15,7 @@ import msgspec
 from skytether.policy import inside, metrics, web
 from skytether.policy.images import QUALITY, Compressor
 from skytether.policy.pace import RATE_MAX, RATE_MIN
-from skytether.policy.players import Clocked, Freshest, Player
+from skytether.policy.players import PLAYERS
 from skytether.policy.robot import AnsweredCall, RobotEnd, RobotOptions
 from skytether.shared.base import extras
 from skytether.shared.base.units import MILLISECOND_NS, seconds_to_ns
@@ -38,8 +38,6 @@ from skytether.shell.processes.process import serving
 if TYPE_CHECKING:
     from skytether.policy.page import CallPage
     from skytether.policy.recording import CallRecording
-
-PLAYERS: dict[str, type[Player]] = {"clock": Clocked, "drtc": Freshest}
 
 ABOUT = """usage: skytether policy serve|join ...
 
@@ -229,10 +227,11 @@ def join(argv: Sequence[str]) -> None:
     # Socket 1 is the local connection, so the second path has number 2.
     numbered = {number + (number > 0): path for number, path in enumerate(paths)}
     with ExitStack() as stack:
+        of_end = _robot_options(options)
         recording: CallRecording | None = None
         page: CallPage | None = None
         if options.record:
-            recording = stack.enter_context(_recorded(options.record, options.actions_key))
+            recording = stack.enter_context(_recorded(options.record, of_end))
         if page_at:
             page = stack.enter_context(_shown(page_at, options))
         watching = [each for each in (recording, page) if each]
@@ -250,10 +249,11 @@ def join(argv: Sequence[str]) -> None:
             options.robot,
             {number: path.peer for number, path in numbered.items()},
             link,
-            _robot_options(options),
+            of_end,
             boot_id=secrets.randbits(63),
             compress=compress,
             on_answer=note,
+            on_step=recording.step if recording else lambda *_: None,
         )
         line = partial(web.ProgramServer, listen_at)
         shell = Shell(end, None, paths=numbered, is_patient=True, line=line)
@@ -289,12 +289,12 @@ def _shown(address: Address, options: JoinOptions) -> Iterator["CallPage"]:
 
 
 @contextmanager
-def _recorded(path: Path, key: str) -> Iterator["CallRecording"]:
+def _recorded(path: Path, options: RobotOptions) -> Iterator["CallRecording"]:
     """Record calls to a file; if the disk fails, calls are answered and the command fails."""
     with extras.named("record"):
         from skytether.policy.recording import CallRecording
     try:
-        recording = CallRecording(path, key)
+        recording = CallRecording(path, options)
     except OSError as error:
         raise CommandError(f"{path}: cannot be written: {error.strerror}", CONFIGURATION) from None
     fault = ""

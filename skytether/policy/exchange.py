@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from skytether.policy import parts
-from skytether.policy.form import PART_HEAD_BYTES, block_parts, form_of
+from skytether.policy.form import PART_HEAD_BYTES, Form, block_parts, form_of
 from skytether.policy.messages import STAMPS, PartMessage, Report, encode
 from skytether.policy.pace import RATE_MAX, Pace, Tally, filtered, fit
 from skytether.policy.parts import Part, Reassembly
@@ -66,6 +66,8 @@ class Exchange:
         self._sent: OrderedDict[tuple[int, int], bool] = OrderedDict()
         """Whether the send rate delayed a part, by stream and number of a message."""
         self._numbers: dict[int, int] = {}
+        self.forms: dict[int, Form] = {}
+        """Form of the newest message of each stream."""
         self._coming: dict[int, _Coming] = {}
         self._whole: dict[int, Reassembly] = {}
         self._tallies: dict[int, Tally] = {}
@@ -90,7 +92,7 @@ class Exchange:
     def _begin(self, stream: int) -> None:
         message, is_urgent = self._next.pop(stream)
         number = self._numbers[stream] = self._numbers.get(stream, -1) + 1
-        form = form_of(len(message), self.pace.loss, is_urgent=is_urgent)
+        form = self.forms[stream] = form_of(len(message), self.pace.loss, is_urgent=is_urgent)
         self._queue[stream] = deque(parts.split(message, stream, number, form.parity))
         self._sent[stream, number] = False
         while len(self._sent) > REMEMBERED_MAX:
@@ -99,6 +101,10 @@ class Exchange:
     def number(self, stream: int) -> int:
         """Number of the stream's newest message of which parts were sent; -1 if there is none."""
         return self._numbers.get(stream, -1)
+
+    def newest(self, stream: int) -> int:
+        """Number of the stream's newest message that has arrived completely."""
+        return self._whole[stream].newest if stream in self._whole else -1
 
     def is_sending(self, stream: int) -> bool:
         """Whether parts of a message of this stream remain to be sent."""

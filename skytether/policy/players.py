@@ -9,6 +9,7 @@ A player stores only tuples, so that a shallow copy is a snapshot of its state.
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
@@ -192,3 +193,7 @@ class Freshest(Player):
         (_, number, rows), *_ = self.held
         self.held, self.played, self.last = self.held[1:], number + 1, rows[0]
         return self.last
+
+
+PLAYERS: dict[str, Callable[[], Player]] = {"clock": Clocked, "drtc": Freshest}
+"""Players by the names of `--merge`."""

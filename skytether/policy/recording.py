@@ -4,6 +4,8 @@
     /observation   numbers and texts of the observation, and its small arrays
     /images/KEY    each image as it was sent to the policy: foxglove.CompressedImage or RawImage
     /events        log events: foxglove.Log
+    /link          observations sent, reports and chunks received, see `robot.LinkStep`
+    /options       options of the robot end, when a program connects
 
 The time of a message is the time of day. A thread encodes and writes the messages, so that no
 answer waits for the disk.
@@ -15,6 +17,7 @@ import time
 from base64 import b64encode
 from collections.abc import Callable, Iterator
 from contextlib import suppress
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skytether.policy.images import JPEG, is_image
-from skytether.policy.robot import AnsweredCall
+from skytether.policy.players import PLAYERS
+from skytether.policy.robot import AnsweredCall, LinkStep, RobotOptions
 from skytether.shared.base import files
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Event
@@ -33,7 +37,7 @@ VALUES_MAX = 256
 """Largest number of elements of an array in `/observation`; of a larger one the shape is given."""
 ACTIONS_MAX = 16_384
 """Largest number of elements of the actions in `/answers`."""
-WAITING_MAX = 64
+WAITING_MAX = 192
 """Largest number of messages that wait for the disk; further ones are not recorded."""
 FLUSH_S, CHUNK_BYTES = 0.25, 16 * 1024
 """Interval at which complete chunks are written [s], and size of a chunk [B]. A killed process
@@ -42,9 +46,16 @@ CLOSING_S = 5.0
 """Longest time to wait for the disk at the end [s]."""
 _ANSWER = {"call": "integer", "kind": "string", "waited_s": "number"}
 _ANSWER |= {"chunk_age_s": "number", "left": "integer"}
+_LINK = {"kind": "string", "call": "integer", "message": "integer", "parts": "integer"}
+_LINK |= {"needed": "integer", "rows": "integer", "fault": "string"}
+_OPTIONS = {"actions": "string", "deadline_ns": "integer", "hold_ns": "integer", "rows": "integer"}
+_FIELDS = {"Answer": _ANSWER, "Link": _LINK, "Observation": {}, "Options": _OPTIONS}
 SCHEMAS = {
-    name: {"type": "object", "properties": {key: {"type": each} for key, each in fields.items()}}
-    for name, fields in {"skytether.Answer": _ANSWER, "skytether.Observation": {}}.items()
+    f"skytether.{name}": {
+        "type": "object",
+        "properties": {key: {"type": each} for key, each in fields.items()},
+    }
+    for name, fields in _FIELDS.items()
 }
 
 
@@ -53,14 +64,14 @@ class CallRecording:
 
     Args:
         path: name of the file; an older file is replaced when the new one is complete.
-        key: key of the actions in the policy's reply.
+        options: options of the robot end.
 
     Raises:
         OSError: the file cannot be written.
     """
 
-    def __init__(self, path: Path, key: str) -> None:
-        self._growing, self._key = files.Growing(path), key
+    def __init__(self, path: Path, options: RobotOptions) -> None:
+        self._growing, self._options = files.Growing(path), options
         self._channels = foxglove.Channels(self._growing.file, "skytether", CHUNK_BYTES)
         self._waiting: queue.Queue[Callable[[], None] | None] = queue.Queue(WAITING_MAX)
         self._offset_ns = time.time_ns() - time.monotonic_ns()
@@ -72,6 +83,10 @@ class CallRecording:
     def note(self, call: AnsweredCall) -> None:
         """Record a call of the robot program and its answer."""
         self._put(partial(self._add_call, call))
+
+    def step(self, now_ns: int, step: LinkStep) -> None:
+        """Record a step of a call on the link."""
+        self._put(partial(self._add_step, now_ns, step))
 
     def hear(self, event: Event) -> None:
         """Record a log event."""
@@ -132,7 +147,7 @@ class CallRecording:
         if call.sent is not None:
             self._add("/observation", "Observation", numbers | {"call": call.number})
         self._channels.now_ns = call.time_ns + self._offset_ns
-        rows = call.reply.get(self._key) if isinstance(call.reply, dict) else None
+        rows = call.reply.get(self._options.key) if isinstance(call.reply, dict) else None
         answer = {
             "call": call.number,
             "kind": call.kind,
@@ -143,12 +158,20 @@ class CallRecording:
         }
         self._add("/answers", "Answer", answer)
 
+    def _add_step(self, now_ns: int, step: LinkStep) -> None:
+        self._channels.now_ns = now_ns + self._offset_ns
+        if step.kind == "program":
+            named = {each: name for name, each in PLAYERS.items()}
+            options = asdict(self._options) | {"player": named[self._options.player]}
+            self._add("/options", "Options", options)
+        self._add("/link", "Link", step)
+
     def _add_event(self, now_ns: int, sentence: str) -> None:
         self._channels.now_ns = now_ns + self._offset_ns
         log = foxglove.log("policy join", sentence, foxglove.INFO)
         self._channels.draw("/events", "Log", log)
 
-    def _add(self, topic: str, kind: str, message: dict[str, Any]) -> None:
+    def _add(self, topic: str, kind: str, message: Any) -> None:
         name = f"skytether.{kind}"
         self._channels.put(topic, name, SCHEMAS[name], message)
 

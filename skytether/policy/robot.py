@@ -22,13 +22,15 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, NamedTuple
 
+import msgspec
+
 from skytether.client.link import ClientLink
 from skytether.policy import events, values
 from skytether.policy.committed import DELAYS, RobotRows
-from skytether.policy.messages import OBSERVATION, ChunkContent, Report, content
+from skytether.policy.messages import CHUNK, OBSERVATION, ChunkContent, Report, content
 from skytether.policy.pace import RATE_MAX
 from skytether.policy.players import Clocked, Player
-from skytether.policy.schedule import Actions, Kind, Schedule
+from skytether.policy.schedule import Actions, Kind, Schedule, rows_of
 from skytether.policy.session import ALIVE_NS, Session
 from skytether.policy.values import ValueRefused
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -77,6 +79,25 @@ class AnsweredCall(NamedTuple):
     """Observation with compressed images; None if it was not sent."""
     reply: Any
     """Reply to the program; None for an error."""
+
+
+class LinkStep(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Event on the way of calls to the policy end and back, for `skytether explain`."""
+
+    kind: str
+    """`program`: a program connects; `session`, or `restart` with a new run of the policy end;
+    `sent`: the first part of an observation; `report`: of the policy end on received parts;
+    `chunk`, or `refused`: an action chunk; `error`: of the policy."""
+    call: int = -1
+    message: int = -1
+    """Number of the message in its stream and session."""
+    parts: int = 0
+    """Number of parts sent, or received."""
+    needed: int = 0
+    """Number of parts that restore the message."""
+    rows: int = 0
+    fault: str = ""
+    """Reason of an error, or for refusing a chunk."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +207,7 @@ class RobotEnd(Endpoint):
         boot_id: random number of this run.
         compress: function that compresses an observation before sending, see `images.Compressor`.
         on_answer: called after each answer.
+        on_step: called with the time [ns] of each `LinkStep`.
     """
 
     def __init__(
@@ -198,10 +220,13 @@ class RobotEnd(Endpoint):
         boot_id: int,
         compress: Callable[[Any], Any] = lambda observation: observation,
         on_answer: Callable[[AnsweredCall], None] | None = None,
+        on_step: Callable[[int, LinkStep], None] = lambda *_: None,
     ) -> None:
         super().__init__()
         self._robot, self._options, self._compress = robot, options, compress
-        self._on_answer = on_answer
+        self._on_answer, self._on_step = on_answer, on_step
+        self._begun = -1
+        """Number of the newest observation's message in this session of which parts were sent."""
         self._session = Session(self, robot, servers, link, boot_id, options.rate_max)
         self._program: _Program | None = None
         self._calls = 0
@@ -227,14 +252,30 @@ class RobotEnd(Endpoint):
                 self._hear_server(datagram, now_ns)
             except ProtocolError as error:
                 self._drops[error.reason] += 1
+        self._send(now_ns)
+
+    def _send(self, now_ns: int) -> None:
         self._session.send(now_ns=now_ns)
+        program, exchange = self._program, self._session.exchange
+        if exchange and (number := exchange.number(OBSERVATION)) > self._begun:
+            # Only the newest observation waits, so the one whose sending begins is the newest.
+            self._begun, form = number, exchange.forms[OBSERVATION]
+            call = next(reversed(program.asked), -1) if program else -1
+            needed, parity = form.blocks * form.data, form.blocks * form.parity
+            self._on_step(now_ns, LinkStep("sent", call, number, needed + parity, needed))
 
     def _hear_server(self, datagram: Datagram, now_ns: int) -> None:
         exchange, program = self._session.exchange, self._program
+        run = self._session.server_boot_id
         heard = self._session.hear(datagram, now_ns=now_ns)
-        if program and self._session.exchange is not exchange:
-            program.since.first = 0  # the messages of a session are counted from 0
+        if self._session.exchange is not exchange:
+            is_new = run not in (0, self._session.server_boot_id)
+            self._on_step(now_ns, LinkStep("restart" if is_new else "session"))
+            self._begun = -1
+            if program:
+                program.since.first = 0  # the messages of a session are counted from 0
         if isinstance(heard, Report):
+            self._on_step(now_ns, LinkStep("report", message=heard.number, parts=heard.came))
             if program and heard.number >= program.since.first:
                 program.since.reported.add(heard.number)
         elif heard:
@@ -258,6 +299,7 @@ class RobotEnd(Endpoint):
                     now_ns,
                 )
                 self._program = _Program(peer, schedule, self._since_now())
+                self._on_step(now_ns, LinkStep("program"))
                 counts = f"{options.rows} row(s) of each answer, see --rows"
                 if options.step_ns:
                     counts = f"a row each {options.step_ns / MILLISECOND_NS:g} ms"
@@ -367,10 +409,12 @@ class RobotEnd(Endpoint):
             if fault != program.since.fault:
                 self._events.append(events.PolicyFailed(robot=self._robot, reason=error[:200]))
             program.since.fault = fault
+            self._note("error", call_number, now_ns, fault=error[:200])
             return
         if program.newest < 0 and (call is None or call_number < call.number):
             why = "its call was answered with an error, and the robot may have been moved since"
             self._events.append(events.ChunkRefused(robot=self._robot, reason=why))
+            self._note("refused", call_number, now_ns, fault=why)
             return
         schedule, delay_ns = program.schedule, now_ns - asked.began_ns
         self._waits = delay_ns <= self._options.deadline_ns
@@ -380,7 +424,9 @@ class RobotEnd(Endpoint):
         except ValueError as refused:
             self._events.append(events.ChunkRefused(robot=self._robot, reason=str(refused)))
             program.since.fault = f"its chunk is refused: {refused}"
+            self._note("refused", call_number, now_ns, fault=str(refused))
             return
+        self._note("chunk", call_number, now_ns, rows=len(rows_of(reply, self._options.key)))
         if program.answers_first:
             self._delays.clear()  # the policy may have compiled before its first chunk
         program.answers_first = program.newest < 0
@@ -395,6 +441,12 @@ class RobotEnd(Endpoint):
             program.since = self._since_now()
         if call and call.number == call_number:
             self._answer(program, call, Kind.FRESH, now_ns)
+
+    def _note(self, kind: str, call: int, now_ns: int, **content: Any) -> None:
+        """Pass on a step of the chunk or error that has just arrived."""
+        exchange = self._session.exchange
+        number = exchange.newest(CHUNK) if exchange else -1
+        self._on_step(now_ns, LinkStep(kind, call, number, **content))
 
     def _answer(
         self, program: _Program, call: _Call, kind: Kind, now_ns: int, error: str = ""
@@ -480,7 +532,7 @@ class RobotEnd(Endpoint):
                 # The program waits for its first answer, and sends no other observation.
                 self._ask(call, now_ns)
         self._session.wake(now_ns=now_ns)
-        self._session.send(now_ns=now_ns)
+        self._send(now_ns)
 
     def figures(self) -> dict[str, Any]:
         exchange, program, last = self._session.exchange, self._program, self._answered

@@ -61,7 +61,8 @@ class Session:
         self._boot_id, self._rate_max = boot_id, rate_max
         self.exchange: Exchange | None = None
         """Messages of the newest session; None before the first."""
-        self._server_boot_id = 0
+        self.server_boot_id = 0
+        """Random number of the policy end's run; 0 before the first session."""
         self._hello_ns: int | None = 0
         """Time of the next HELLO [ns]; None during a session."""
         self._hellos = 0
@@ -111,11 +112,11 @@ class Session:
             return
         self._link.adopt(now_ns=now_ns)
         self.heard_ns, self._hello_ns, self._hellos = now_ns, None, 0
-        before = self.exchange and self.exchange.session, self._server_boot_id
+        before = self.exchange and self.exchange.session, self.server_boot_id
         if before == (welcome.session, welcome.server_boot_id):
             return
         self.exchange = Exchange(welcome.session, self._rate_max)
-        self._server_boot_id, self._has_metadata = welcome.server_boot_id, False
+        self.server_boot_id, self._has_metadata = welcome.server_boot_id, False
         self._end.tell(events.PolicyJoined(robot=self._robot, peer=address_text(*peer)))
         self._say_alive(self.exchange, now_ns)
 

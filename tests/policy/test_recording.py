@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from policy_lab import messages
+from policy_lab import OPTIONS, messages
 from skytether.policy import events, recording
 from skytether.policy.images import Compressor
 from skytether.policy.recording import CallRecording
@@ -33,7 +33,7 @@ def test_images_are_recorded_as_they_were_sent(tmp_path: Path) -> None:
         "state": np.array([1.5, np.nan]),
         "map": np.zeros((100, 100)),
     }
-    written = CallRecording(tmp_path / "a.mcap", "actions")
+    written = CallRecording(tmp_path / "a.mcap", OPTIONS)
     sent = Compressor(raw=["images/top"])(seen)
     written.note(answered(1, sent, {"actions": np.array([[1, 2]])}))
     written.note(answered(2))
@@ -55,7 +55,7 @@ def test_images_are_recorded_as_they_were_sent(tmp_path: Path) -> None:
 def test_a_full_disk_stops_the_recording_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    written = CallRecording(tmp_path / "a.mcap", "actions")
+    written = CallRecording(tmp_path / "a.mcap", OPTIONS)
 
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -68,7 +68,7 @@ def test_a_full_disk_stops_the_recording_alone(
 
 def test_a_slow_disk_never_delays_a_call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     free = threading.Event()
-    written = CallRecording(tmp_path / "a.mcap", "actions")
+    written = CallRecording(tmp_path / "a.mcap", OPTIONS)
     monkeypatch.setattr(written, "_add_call", lambda _: free.wait())
     for number in range(recording.WAITING_MAX + 10):
         written.note(answered(number))
