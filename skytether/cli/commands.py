@@ -43,7 +43,7 @@ COMMANDS_IN_GROUPS = {
     },
     "After a flight": {
         "explain SCENARIO|FILE": (
-            "why a flight in virtual time braked or was far off",
+            "why a flight braked or was far off, or a robot held still",
             "skytether.explain.command:explain_flight",
         ),
         "replay FILE": (

@@ -1,10 +1,30 @@
 """Reading of recordings for commands."""
 
+from contextlib import closing
+from itertools import islice
 from pathlib import Path
 
 from skytether.cli.page_process import say
 from skytether.shell.commandline.command import CONFIGURATION, CommandError
+from skytether.view.recordings.container import Container, reading
 from skytether.view.recordings.recorded import Recorded, read
+
+HEAD_MESSAGES = 100
+"""Number of messages from which the kind of a recording is recognised."""
+
+
+CALLS = {"/answers", "/link", "/options"}
+"""Topics of recordings of `skytether policy join`."""
+
+
+def is_of_calls(path: Path) -> bool:
+    """Whether a recording is of calls of a robot program; raises CommandError as `opened`."""
+    try:
+        with closing(Container(path)) as file, reading(path):
+            return any(topic in CALLS for topic, *_ in islice(file.timed("json"), HEAD_MESSAGES))
+    except OSError as error:
+        message = f"{path}: cannot be read: {error.strerror}"
+        raise CommandError(message, CONFIGURATION) from None
 
 
 def opened(path: Path) -> Recorded:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import msgspec
 import numpy as np
 
 from skytether.cli import recordings
@@ -15,6 +16,7 @@ from skytether.explain.explanation import FIRST, STEPS, Explanation, check_same,
 from skytether.explain.flying import CaseOutcome, Track, fly
 from skytether.figures import flights as figures
 from skytether.lab.commands.pool import Flags, Interrupted, PoolFlags, crew
+from skytether.shared.base import extras
 from skytether.shared.missions.mission import Mission
 from skytether.shared.scenario.whole import Scenario
 from skytether.shared.telemetry.record import RECORDING, trace_hash
@@ -33,9 +35,10 @@ class ExplainOptions:
 
     scenario: ScenarioName = "demo"
     """A scenario's name (`skytether list scenarios`), a .toml file, or a recording (.mcap) of a
-    flight in virtual time or over UDP."""
+    flight in virtual time or over UDP, or of `skytether policy join`."""
     at: Annotated[float | None, Argument(metavar="T")] = None
-    """Time of flight of the moment to explain [s]; by default of the most severe moment."""
+    """Time of flight of the moment to explain [s]; by default of the most severe moment. For calls
+    of a robot program: time since the start of the recording; by default of all gaps."""
     vehicle: Annotated[int | None, Argument(metavar="N")] = None
     """Number of the vehicle of the moment to explain; by default any vehicle."""
     seeds: Annotated[int, Argument(metavar="N")] = 0
@@ -61,6 +64,10 @@ def explain_flight(argv: Sequence[str]) -> None:
 
     A recorded flight over UDP is replaced by its double, which flies in virtual time. Ctrl-C prints
     the explanation so far.
+
+    For a recording of `skytether policy join`, the text gives for each gap, in which no row of the
+    policy remained, the cause, and what would have averted it: the recorded calls are replayed with
+    the chunks that were lost, late or refused, with longer chunks and with another deadline.
     """
     if argv and argv[0].endswith(RECORDING):
         options = read(ExplainOptions(), argv, "skytether explain", explain_flight.__doc__)
@@ -69,6 +76,9 @@ def explain_flight(argv: Sequence[str]) -> None:
         if options.vehicles != ExplainOptions.vehicles:
             message = f"--vehicles: got {options.vehicles} with a recording, which has its own"
             raise CommandError(message, command.CONFIGURATION)
+        if recordings.is_of_calls(Path(options.scenario)):
+            _explain_calls(options)
+            return
         found = recordings.opened(Path(options.scenario))
         if found.about.began and found.scenario.keeps_apart:
             _judge(options, found)
@@ -102,16 +112,37 @@ def _vehicles(options: ExplainOptions) -> int:
     return len(reference.vehicles) if isinstance(reference, Mission) else 1
 
 
+def _explain_calls(options: ExplainOptions) -> None:
+    """Explain the gaps in the calls of a robot program.
+
+    Raises:
+        CommandError: an option is for flights.
+    """
+    _check_unused(options, ("vehicle", "seeds", "figure"), "a recording of calls")
+    with extras.named("policy"):
+        from skytether.explain import calls, gaps
+    programs = calls.read(Path(options.scenario))
+    found = list(gaps.gaps(programs, options.at))
+    if options.json is not None:
+        command.write(options.json, msgspec.json.encode(found))
+    print(gaps.text(programs, found))
+
+
+def _check_unused(options: ExplainOptions, names: Sequence[str], what: str) -> None:
+    """Refuse options; raises CommandError if one is given."""
+    for name in names:
+        if getattr(options, name) != getattr(ExplainOptions, name):
+            raise CommandError(f"--{name}: got it with {what}", command.CONFIGURATION)
+
+
 def _judge(options: ExplainOptions, recorded: Recorded) -> None:
     """Print the checked assumptions of the separation theorem, for a mission flown over UDP.
 
     Raises:
         CommandError: a part of the record is missing, or an option needs more flights.
     """
-    for name in ("at", "vehicle", "seeds", "json", "figure"):
-        if getattr(options, name) != getattr(ExplainOptions, name):
-            message = f"--{name}: got it with a flight over UDP, which cannot be flown again"
-            raise CommandError(message, command.CONFIGURATION)
+    which = "a flight over UDP, which cannot be flown again"
+    _check_unused(options, ("at", "vehicle", "seeds", "json", "figure"), which)
     missing = {"client", "server", "plan"} - recorded.parts.keys()
     if missing:
         message = f"{recorded.path}: no rows of {', '.join(sorted(missing))}"

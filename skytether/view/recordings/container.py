@@ -144,7 +144,11 @@ class Container:
         self._file.close()
 
     def messages(self) -> Iterator[tuple[str, bytes]]:
-        """Topics and contents of messages with the encoding ENCODING, in file order.
+        """Topics and contents of messages with the encoding ENCODING, see `timed`."""
+        return ((topic, content) for topic, _, content in self.timed(ENCODING))
+
+    def timed(self, wanted: str) -> Iterator[tuple[str, int, bytes]]:
+        """Topics, times [ns] and contents of messages with an encoding, in file order.
 
         A damaged record is skipped, with everything up to the next chunk. If a message is lost, its
         copy is returned.
@@ -158,7 +162,7 @@ class Container:
         for record in self._unpacked():
             match record:
                 case Channel(message_encoding=encoding):
-                    topics[record.id] = record.topic if encoding == ENCODING else ""
+                    topics[record.id] = record.topic if encoding == wanted else ""
                     if original := record.metadata.get(COPY_OF):
                         has_copies = True
                         is_needed = int(original) not in topics
@@ -173,7 +177,7 @@ class Container:
                     messages_left -= 1
                     if messages_left < 0:
                         raise ValueError("it has more messages than fit into its size")
-                    yield topic, record.data
+                    yield topic, record.log_time, record.data
 
     def _unpacked(self) -> Iterator[McapRecord]:
         """Records of channels and messages in all chunks, in file order."""
