@@ -171,7 +171,7 @@ def gaps(programs: Sequence[Program], at_s: float | None = None) -> Iterator[Gap
 def text(programs: Sequence[Program], found: Sequence[Gap]) -> str:
     """Explanation of the gaps of a recording; of more than SHOWN_MAX the causes are counted."""
     calls = sum(len(each.calls) for each in programs)
-    lines = [f"{len(found)} gap{'s' * (len(found) != 1)} in {calls} calls."]
+    lines = [f"{len(found) or 'No'} gap{'s' * (len(found) > 1)} in {calls} calls."]
     lines += [f"\n{each}" for each in found[:SHOWN_MAX]]
     if further := Counter(each.parts[0].cause for each in found[SHOWN_MAX:]):
         counts = ", ".join(f"{cause} ({count})" for cause, count in further.items())
@@ -195,14 +195,13 @@ class _Window:
         self._places = range(first - start, len(self._calls))
         """Places of the gap's calls in the replay."""
         self.replay = recorded(program, self._calls)
-        before = range(self._places.start)
-        pauses_ns = [self.replay.pauses_ns[i] for i in before][1:]
-        self._pause_ns = int(median(pauses_ns)) if pauses_ns else 0
+        end_of_usual = self._places.start if self._places.start >= FEW else None
+        self._pause_ns = int(median(self.replay.pauses_ns[1:end_of_usual] or [0]))
         options = program.options
         self._step_ns = options.step_ns or max(self._pause_ns // options.rows, MILLISECOND_NS)
         self._near = calls[start : end + BEFORE]
         self._arrivals = [arrival for each in self._near for arrival in each.arrivals]
-        good = [each for each in self._calls[: len(before)] if each.rows]
+        good = [each for each in self._calls[: self._places.start] if each.rows]
         self._good = good if len(good) >= FEW else [each for each in self._near if each.rows]
         """Calls whose chunks are usual: those before the gap or, if these are few, near it."""
         asked = sum(each.is_asked for each in self._near)
