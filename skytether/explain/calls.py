@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from heapq import heappop, heappush
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,10 +33,12 @@ from skytether.policy.robot import (
 from skytether.policy.schedule import ROWS_MAX, Kind
 from skytether.shared.base.units import SECOND_NS
 from skytether.shared.endpoints.endpoint import Address, Datagram
-from skytether.view.recordings.container import Container, reading
+from skytether.view.recordings.container import Container
 
 SERVER: Address = ("server", 1)
 PROGRAM: Address = ("program", 1)
+WAIT_NS_MAX = 600 * SECOND_NS
+"""Longest pause and longest delay of a chunk in a replay [ns]."""
 INVALID = b"\xc1"
 """Observation that the robot end refuses."""
 NO_ROW = (Kind.HOLD, Kind.ERROR)
@@ -116,9 +119,9 @@ def read(path: Path) -> list[Program]:
 
     Raises:
         OSError: the file cannot be read.
-        RecordingError: the file is damaged, or not such a recording.
+        BROKEN: the file is damaged, see `container`.
     """
-    with closing(Container(path)) as file, reading(path):
+    with closing(Container(path)) as file:
         asked, messages, begin_ns = set[int](), list[tuple[int, str, bytes]](), 0
         for topic, time_ns, data in file.timed("json"):
             begin_ns = begin_ns or time_ns
@@ -133,6 +136,8 @@ def read(path: Path) -> list[Program]:
                 options = _options(data)
             elif topic == "/link":
                 step = msgspec.json.decode(data, type=LinkStep)
+                if not 0 <= step.rows <= ROWS_MAX:
+                    raise ValueError(f"a chunk has {step.rows} rows")
                 steps.append((time_ns, step))
                 if step.kind == "program" and options:
                     programs.append(Program(options, begin_ns, sessions))
@@ -264,18 +269,15 @@ def _chunk(call: int, message: int, reply: Reply | None) -> list[Datagram]:
 def recorded(program: Program, calls: Sequence[Call]) -> Replay:
     """Replay of successive calls of a program as recorded."""
     options = replace(program.options, key="actions")
-    pauses_ns, before = [], None
+    pauses_ns = [0]
+    for before, call in pairwise(calls):
+        is_after = call.began_ns > before.answered_ns
+        pause_ns = call.began_ns - (before.answered_ns if is_after else before.began_ns)
+        pauses_ns.append(min(max(pause_ns, 0), WAIT_NS_MAX))
+    replies: list[Reply | None] = []
     for call in calls:
-        if before is None:
-            pauses_ns.append(0)
-        elif call.began_ns > before.answered_ns:
-            pauses_ns.append(call.began_ns - before.answered_ns)
-        else:
-            pauses_ns.append(call.began_ns - before.began_ns)
-        before = call
-    replies = [
-        Reply(call.chunk.time_ns - call.began_ns, call.chunk.step.rows) if call.chunk else None
-        for call in calls
-    ]
+        delay_ns = call.chunk.time_ns - call.began_ns if call.chunk else -1
+        is_in_time = 0 <= delay_ns <= WAIT_NS_MAX
+        replies.append(Reply(delay_ns, call.rows) if is_in_time else None)
     refused = frozenset(i for i, each in enumerate(calls) if each.is_refused)
     return Replay(options, calls, pauses_ns, replies, refused)

@@ -26,6 +26,7 @@ from skytether.shell.commandline.command import CommandError, ScenarioFlags, Sce
 from skytether.shell.commandline.options import read
 from skytether.shell.host import system
 from skytether.theorem.judgement import judged
+from skytether.view.recordings.container import reading
 from skytether.view.recordings.recorded import Recorded
 
 
@@ -121,8 +122,10 @@ def _explain_calls(options: ExplainOptions) -> None:
     _check_unused(options, ("vehicle", "seeds", "figure"), "a recording of calls")
     with extras.named("policy"):
         from skytether.explain import calls, gaps
-    programs = calls.read(Path(options.scenario))
-    found = list(gaps.gaps(programs, options.at))
+    path = Path(options.scenario)
+    with reading(path):
+        programs = calls.read(path)
+        found = list(gaps.gaps(programs, options.at))
     if options.json is not None:
         command.write(options.json, msgspec.json.encode(found))
     print(gaps.text(programs, found))

@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from enum import StrEnum
 from functools import cached_property
-from itertools import pairwise
 from statistics import median
 from typing import NamedTuple
 
@@ -41,8 +40,8 @@ LONG = 2
 """Multiple of the usual time from which a pause, or the time between two chunks, is a unit."""
 RUNS_MAX = 8
 """Largest number of runs of calls that are listed."""
-TIME_NS_MAX = 10 * SECOND_NS
-"""Longest deadline that is tried [ns]."""
+ROWS_FACTOR, TIME_NS_MAX = 8, 10 * SECOND_NS
+"""Largest multiple of the usual number of rows, and longest deadline, that are tried [ns]."""
 
 
 class Cause(StrEnum):
@@ -96,7 +95,8 @@ class Gap(msgspec.Struct, frozen=True):
     replayed: int
 
     def __str__(self) -> str:
-        said = [f"{len(calls)} {what}" for calls, what in self._kinds if calls]
+        kinds = (self.holds, "hold"), (self.errors, "error")
+        said = [f"{len(each)} {kind}{'s' * (len(each) > 1)}" for each, kind in kinds if each]
         numbers = sorted((*self.holds, *self.errors))
         times = f"{self.start_s:.2f} s to {self.start_s + self.length_s:.2f} s"
         length = f"no row for {self.length_s:.2f} s"
@@ -115,11 +115,6 @@ class Gap(msgspec.Struct, frozen=True):
                 f"Only {self.equal} of {self.replayed} answers of the replay are as recorded."
             )
         return "\n".join(lines)
-
-    @property
-    def _kinds(self) -> Iterator[tuple[tuple[int, ...], str]]:
-        yield self.holds, f"hold{'s' * (len(self.holds) != 1)}"
-        yield self.errors, f"error{'s' * (len(self.errors) != 1)}"
 
 
 def _repair(parts: Sequence[Part]) -> str:
@@ -204,9 +199,6 @@ class _Window:
         good = [each for each in self._calls[: self._places.start] if each.rows]
         self._good = good if len(good) >= FEW else [each for each in self._near if each.rows]
         """Calls whose chunks are usual: those before the gap or, if these are few, near it."""
-        asked = sum(each.is_asked for each in self._near)
-        self._skips = LONG * sum(bool(each.rows) for each in self._near) < asked
-        """Whether most observations get no chunk."""
 
     def _usual(self, time_ns: Callable[[Call, Arrival], int | None]) -> int:
         """Median of a time over the usual chunks [ns]; 0 if there is none."""
@@ -276,7 +268,7 @@ class _Window:
         varies_ns = max(trips_ns, default=0) - self._usual(lambda each, _: _trip(each))
         return Cause.SLOW if is_late and varies_ns < late_ns // 2 else Cause.DELAY
 
-    def _why_missing(self, call: Call) -> Cause | None:
+    def _why_missing(self, call: Call) -> Cause:
         before, after = self._around(call)
         begun = [each for each in self._program.sessions if each[0] > call.began_ns]
         is_complete = call.came >= call.needed
@@ -293,7 +285,7 @@ class _Window:
             return Cause.SLOW if is_complete and is_heard else Cause.EITHER
         return self._way(call, before, after)
 
-    def _way(self, call: Call, before: Arrival | None, after: Arrival) -> Cause | None:
+    def _way(self, call: Call, before: Arrival | None, after: Arrival) -> Cause:
         """Where a chunk was lost between two arrivals of one session."""
         first, missing = before.step.call if before else 0, self._missing(before, after)
         between = [each for each in self._near if first < each.number < after.step.call]
@@ -304,11 +296,8 @@ class _Window:
             return Cause.TO_ROBOT if is_majority else Cause.TO_POLICY
         if LONG * missing > complete:
             return Cause.TO_ROBOT
-        times_ns = sorted(each.time_ns for each in self._arrivals)
-        spaces_ns = [after_ns - at_ns for at_ns, after_ns in pairwise(times_ns)]
-        is_near = before and after.time_ns - before.time_ns <= LONG * median(spaces_ns)
-        # A policy end keeps only the newest observation while the policy computes.
-        return None if is_near and self._skips else Cause.SLOW
+        # While the policy computes, the policy end keeps only the newest observation.
+        return Cause.SLOW
 
     def _around(self, call: Call) -> tuple[Arrival | None, Arrival | None]:
         """Last arrival for an earlier call, and first for a later call."""
@@ -323,7 +312,8 @@ class _Window:
         """Number of chunks sent between two arrivals that have not arrived."""
         first = before.message if before else -1
         came = {each.message for each in self._arrivals if each.session == after.session}
-        return len(set(range(first + 1, after.message)) - came)
+        sent = range(first + 1, after.message)
+        return len(sent) - sum(each in sent for each in came)
 
     # -- repairs -----------------------------------------------------------------------------------
 
@@ -349,12 +339,10 @@ class _Window:
             return [self._averts(self._repaired(self._of(each))) for each in sets]
 
         kinds = tuple(dict.fromkeys(each.cause for each in self.units))
-        if not kinds:
-            return (Part(Cause.USUAL, self._usually(), (), ()),), False
-        if self.usual is None:
+        if kinds and self.usual is None:
             return tuple(self._part(each, self._of((each,)), ()) for each in kinds), False
-        if not self._averts(self._repaired(self.units)):
-            return (Part(Cause.USUAL, self._usually(), (), ()),), False
+        if self.usual is None or not self._averts(self._repaired(self.units)):
+            return (Part(Cause.USUAL, self._evidence(Cause.USUAL, ()), (), ()),), False
         averts = suffice([(each,) for each in kinds])
         alone: list[tuple[Cause, ...]] = [
             (each,) for each, good in zip(kinds, averts, strict=True) if good
@@ -384,13 +372,11 @@ class _Window:
 
     # -- evidence ----------------------------------------------------------------------------------
 
-    def _usually(self) -> str:
-        if self.usual is None:
-            return "No chunk has arrived before."
-        delay_s = self.usual.delay_ns / SECOND_NS
-        return f"Chunks have {self.usual.rows} rows and arrive {delay_s:.3f} s after their calls."
-
     def _evidence(self, cause: Cause, calls: Sequence[Call]) -> str:
+        delay_ns, rows = self.usual or (0, 0)
+        usually = f"{delay_ns / SECOND_NS:.3f} s"
+        if cause is Cause.USUAL:
+            return f"Chunks have {rows} rows and arrive {usually} after their calls."
         said = _calls([each.number for each in calls])
         chunks = [each.chunk for each in calls if each.chunk]
         faults = dict.fromkeys(each.step.fault for each in chunks if each.step.fault)
@@ -406,8 +392,7 @@ class _Window:
             return f"{said.capitalize()}: {'; '.join([*faults][:2])}."
         if chunks:
             late_ns = max(each.chunk.time_ns - each.began_ns for each in calls if each.chunk)
-            usual_s = self.usual.delay_ns / SECOND_NS if self.usual else 0.0
-            when = f"up to {late_ns / SECOND_NS:.3f} s after their calls, usually {usual_s:.3f} s"
+            when = f"up to {late_ns / SECOND_NS:.3f} s after their calls, usually {usually}"
             return f"{said.capitalize()}: {len(chunks)} of {len(calls)} chunks arrived, {when}."
         sent = [each for each in calls if each.sent_ns is not None]
         whole = sum(each.came >= each.needed for each in sent)
@@ -442,11 +427,9 @@ class _Window:
             changed = replace(options, deadline_ns=deadline_ns)
             return self._averts(replace(self.replay, options=changed))
 
-        tried = [usual.rows + more for more in (1, 2, 4, 8, 16, 32, 64)]
-        tried += [usual.rows * factor for factor in (2, 4, 8)]
-        if rows := _least(sorted(each for each in tried if each <= ROWS_MAX), with_rows):
-            least = _least(range(usual.rows + 1, rows + 1), with_rows)
-            yield f"chunks of {least} rows instead of {usual.rows}"
+        most = min(ROWS_FACTOR * usual.rows, ROWS_MAX)
+        if rows := _least(range(usual.rows + 1, most + 1), with_rows):
+            yield f"chunks of {rows} rows instead of {usual.rows}"
         delays_ns = {
             -(-each.delay_ns // (10 * MILLISECOND_NS)) * 10 * MILLISECOND_NS
             for each in self.replay.replies

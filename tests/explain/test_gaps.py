@@ -68,11 +68,11 @@ def pauses(seconds: float) -> Breaks:
     return lambda lab, i: lab.sleep(seconds) if i == BEGIN else None
 
 
-def thinks(seconds: float, number: int) -> Breaks:
+def thinks(seconds: float, number: int, usual_s: float = 0.03) -> Breaks:
     """The policy takes longer for some observations."""
 
     def breaks(lab: Lab, i: int) -> None:
-        lab.thinking_ns = int((seconds if BEGIN <= i < BEGIN + number else 0.03) * 1e9)
+        lab.thinking_ns = int((seconds if BEGIN <= i < BEGIN + number else usual_s) * 1e9)
 
     return breaks
 
@@ -105,12 +105,18 @@ def loses_parts(lab: Lab, i: int) -> None:
     lab.robot.leaves = leaves  # type: ignore[attr-defined]
 
 
-def replies(how: Callable[[], Any], number: int = 6) -> Callable[[Any], Any]:
+def rows(number: int) -> Callable[[Any], Any]:
+    return lambda _: {"actions": np.zeros((number, 1), np.float32)}
+
+
+def replies(
+    how: Callable[[], Any], number: int = 6, first: int = BEGIN, usual: Any = ramp
+) -> Callable[[Any], Any]:
     """Policy whose replies to some observations are different."""
     asked = count()
 
     def policy(observation: Any) -> Any:
-        return how() if BEGIN <= next(asked) < BEGIN + number else ramp(observation)
+        return how() if first <= next(asked) < first + number else usual(observation)
 
     return policy
 
@@ -121,10 +127,6 @@ def raises() -> Any:
 
 def not_finite() -> Any:
     return {"actions": np.full((10, 1), np.nan)}
-
-
-def rows(number: int) -> Callable[[Any], Any]:
-    return lambda _: {"actions": np.zeros((number, 1), np.float32)}
 
 
 def larger(size: int, otherwise: int = 10) -> Callable[[int], Any]:
@@ -183,6 +185,18 @@ BROKEN: dict[str, tuple[Cause, dict[str, Any]]] = {
     "policy end killed": (Cause.RESTART, {"breaks": killed}),
     "policy slow, 4 times": (Cause.SLOW, {"breaks": thinks(0.7, 4)}),
     "policy slow, twice": (Cause.SLOW, {"breaks": thinks(1.5, 2)}),
+    "policy slow, also before": (
+        Cause.SLOW,
+        {"breaks": thinks(1.5, 2, 0.25), "policy": rows(30)},
+    ),
+    "outage, slow policy": (
+        Cause.TO_POLICY,
+        to_policy("outage(6, 1.2)", thinking=0.25, policy=rows(30)),
+    ),
+    "errors, slow policy": (
+        Cause.ERROR,
+        {"policy": replies(raises, 4, 20, rows(30)), "thinking": 0.25},
+    ),
     "errors": (Cause.ERROR, {"policy": replies(raises)}),
     "errors for 2 s": (Cause.ERROR, {"policy": replies(raises, 20)}),
     "chunks refused": (Cause.CHUNK_REFUSED, {"policy": replies(not_finite)}),
@@ -204,8 +218,9 @@ BROKEN: dict[str, tuple[Cause, dict[str, Any]]] = {
     "chunks too short": (Cause.USUAL, {"thinking": 0.29, "policy": rows(5), "number": 20}),
 }
 """Cause that the explanation must name, and what is broken."""
-ONE_OF_TWO = {"jitter to the robot"}
-"""Cases of which two causes are named: a chunk overtaken by a newer one counts as lost."""
+ONE_OF_TWO = {"jitter to the robot", "errors, slow policy"}
+"""Cases of which two causes are named, because either suffices: a chunk overtaken by a newer one
+counts as lost, and a faster policy would have sent a chunk before the errors."""
 
 
 @pytest.mark.parametrize("broken", BROKEN)
