@@ -1,5 +1,5 @@
 """Explain why a vehicle braked, was far off or came too close, or why the server sent too many
-plans.
+plans; and why a robot program got no action of its policy.
 
 A flight in virtual time is the same to the last bit each time, and the loss and delay of a packet
 follow from seed, direction, flow and time. So the same flight can be flown again without an outage,
@@ -24,6 +24,7 @@ The modules, in the order of their use:
 | `remedies` | changes of keys that help, over the same network and with other seeds |
 | `explanation` | the whole explanation, step by step |
 | `words`, `picture` | the explanation as text and as a picture |
+| `calls`, `gaps` | recorded calls of a robot program, their replay, and why no row remained |
 | `command` | the command, the only module with processes, files and the terminal |
 
 **Cause.** A set of units *suffices* if the moment occurs with these units alone: within the window,

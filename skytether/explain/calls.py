@@ -78,8 +78,7 @@ class Call:
     @property
     def chunk(self) -> Arrival | None:
         """Its chunk or, without one, the error or refused chunk."""
-        order = sorted(self.arrivals, key=lambda each: (each.step.kind != "chunk", each.time_ns))
-        return order[0] if order else None
+        return min(self.arrivals, key=lambda each: each.step.kind != "chunk", default=None)
 
     @property
     def rows(self) -> int:

@@ -253,13 +253,9 @@ class _Window:
         return late or (Cause.CHUNK_REFUSED if chunk.step.kind == "refused" else None)
 
     def _why_late(self, call: Call, chunk: Arrival) -> Cause | None:
-        if not self.usual or call.sent_ns is None:
+        late_ns = chunk.time_ns - call.began_ns - (self.usual.delay_ns if self.usual else 0)
+        if not self.usual or late_ns <= self._step_ns:
             return None
-        late_ns = chunk.time_ns - call.began_ns - self.usual.delay_ns
-        if late_ns <= self._step_ns:
-            return None
-        if call.sent_ns - call.began_ns > late_ns // 2:
-            return Cause.SEND_RATE
         after_ns = _after_report(call, chunk)
         is_late = after_ns is not None and after_ns - self._usual(_after_report) > late_ns // 2
         # The report of a neighbour shows whether the network is as late.
@@ -279,9 +275,8 @@ class _Window:
         if call.came and not is_complete:
             return Cause.TO_POLICY
         if after is None or (before and before.session != after.session):
-            usual_ns = self.usual.delay_ns if self.usual else SECOND_NS
             heard_ns = max(each.reported_ns or 0 for each in self._near)
-            is_heard = heard_ns > call.began_ns + LONG * usual_ns
+            is_heard = self.usual and heard_ns > call.began_ns + LONG * self.usual.delay_ns
             return Cause.SLOW if is_complete and is_heard else Cause.EITHER
         return self._way(call, before, after)
 
@@ -405,7 +400,7 @@ class _Window:
             chunks_sent = "the next chunk is of a new session"
         elif after:
             missing = self._missing(before, after)
-            chunks_sent = f"{missing or 'no'} chunk{'s' * (missing != 1)} lost by their numbers"
+            chunks_sent = f"{missing or 'no'} chunk{'s' * (missing != 1)} missing by number"
         return f"{said.capitalize()}: {counts}; {chunks_sent}."
 
     # -- options -----------------------------------------------------------------------------------
@@ -437,15 +432,6 @@ class _Window:
         }
         if deadline_ns := _least(sorted(delays_ns), with_deadline):
             yield f"--deadline {deadline_ns // MILLISECOND_NS}ms"
-        if options.spare_rows is not None:
-            replies: list[Reply | None] = []
-            last: Reply | None = usual
-            for call, each in zip(self._calls, self.replay.replies, strict=True):
-                last = (usual if each else None) if call.is_asked else last
-                replies.append(each if call.is_asked else last)
-            always = replace(options, spare_rows=None)
-            if self._averts(replace(self.replay, options=always, replies=replies)):
-                yield "--when always"
 
 
 def _after_report(call: Call, chunk: Arrival) -> int | None:

@@ -185,6 +185,7 @@ BROKEN: dict[str, tuple[Cause, dict[str, Any]]] = {
     "policy end killed": (Cause.RESTART, {"breaks": killed}),
     "policy slow, 4 times": (Cause.SLOW, {"breaks": thinks(0.7, 4)}),
     "policy slow, twice": (Cause.SLOW, {"breaks": thinks(1.5, 2)}),
+    "policy hangs": (Cause.SLOW, {"breaks": thinks(1000.0, 80)}),
     "policy slow, also before": (
         Cause.SLOW,
         {"breaks": thinks(1.5, 2, 0.25), "policy": rows(30)},
@@ -205,6 +206,10 @@ BROKEN: dict[str, tuple[Cause, dict[str, Any]]] = {
         Cause.SEND_RATE,
         {"observe": larger(2500), "options": options(rate_max=20_000.0)},
     ),
+    "send rate, late": (
+        Cause.SEND_RATE,
+        {"observe": larger(1200), "options": options(rate_max=20_000.0)},
+    ),
     "rate of the network": (Cause.DELAY, to_policy("rate(12000)", observe=larger(1500))),
     "jitter to the policy": (
         Cause.DELAY,
@@ -214,19 +219,21 @@ BROKEN: dict[str, tuple[Cause, dict[str, Any]]] = {
         Cause.DELAY,
         {"to_robot": "gamma(0.02, 0.2, 0.3)", "number": 160},
     ),
-    "pause of the program": (Cause.PAUSE, {"breaks": pauses(2.3), "thinking": 0.2}),
+    "pause of the program": (Cause.PAUSE, {"breaks": pauses(2.3), "thinking": 0.25}),
     "chunks too short": (Cause.USUAL, {"thinking": 0.29, "policy": rows(5), "number": 20}),
 }
 """Cause that the explanation must name, and what is broken."""
-ONE_OF_TWO = {"jitter to the robot", "errors, slow policy"}
+ONE_OF_TWO = {"jitter to the robot", "errors, slow policy", "send rate, late"}
 """Cases of which two causes are named, because either suffices: a chunk overtaken by a newer one
-counts as lost, and a faster policy would have sent a chunk before the errors."""
+counts as lost, a faster policy would have sent a chunk before the errors, and an observation that
+takes long to send seems late in the network."""
 
 
 @pytest.mark.parametrize("broken", BROKEN)
 def test_the_explanation_names_what_was_broken(broken: str, tmp_path: Path) -> None:
     truth, how = BROKEN[broken]
-    gap, *_ = explained(record(tmp_path / "calls.mcap", **how))
+    found = explained(record(tmp_path / "calls.mcap", **how))
+    gap = next(each for each in found if min(*each.holds, *each.errors, BEGIN) > 8)
     named = [each.cause for each in gap.parts]
     assert truth in named
     assert len(named) == 1 + (broken in ONE_OF_TWO)
@@ -290,6 +297,7 @@ def test_the_documented_explanation(
         r"skytether explain calls.mcap\n```\n\n```\n(.*?)```", DOCUMENT.read_text(), re.DOTALL
     )
     assert capsys.readouterr().out == shown
+    assert f"{len(BROKEN)} runs in\nvirtual time" in DOCUMENT.read_text()
     (gap,) = msgspec.json.decode(Path("gaps.json").read_bytes(), type=list[Gap])
     assert gap.parts[0].cause is Cause.TO_ROBOT
     assert main(["explain", "calls.mcap", "--at", "1"]) == 0
@@ -310,7 +318,7 @@ def test_a_damaged_recording_is_refused(tmp_path: Path, capsys: pytest.CaptureFi
 
 
 def test_a_long_gap_is_explained_by_its_first_calls(tmp_path: Path) -> None:
-    number = BEGIN + 3 * gaps.LENGTH_MAX
+    number = BEGIN + 2 * gaps.LENGTH_MAX
     (gap,) = explained(record(tmp_path / "a.mcap", cut(number), number=number))
-    assert len(gap.errors) > 2 * gaps.LENGTH_MAX
+    assert len(gap.errors) > gaps.LENGTH_MAX
     assert gap.replayed <= gaps.BEFORE + gaps.LENGTH_MAX

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from policy_lab import OPTIONS, messages
+from policy_lab import MS, OPTIONS, Lab, messages, state
 from skytether.policy import events, recording
 from skytether.policy.images import Compressor
 from skytether.policy.recording import CallRecording
@@ -50,6 +50,28 @@ def test_images_are_recorded_as_they_were_sent(tmp_path: Path) -> None:
     assert found["/events"]["message"] == str(events.Holding(robot=1, reason="no session"))
     answers = [each for topic, each in messages(tmp_path / "a.mcap") if topic == "/answers"]
     assert [each["actions"] for each in answers] == [[[1, 2]], None]
+
+
+def test_the_way_of_each_call_is_recorded(tmp_path: Path) -> None:
+    """Sent, reported and answered by a chunk; the second call's observation is lost."""
+    lab = Lab(to_policy="outage(0.2, 0.2)")
+    written = CallRecording(tmp_path / "a.mcap", OPTIONS)
+    lab.robot._on_step = written.step
+    lab.connect()
+    lab.infer(state(1.0))
+    lab.sleep(0.2)
+    lab.infer(state(1.0))
+    assert written.close() == ""
+    found = list(messages(tmp_path / "a.mcap"))
+    options = [each for topic, each in found if topic == "/options"]
+    assert [(each["deadline_ns"], each["player"]) for each in options] == [(150 * MS, "clock")]
+    steps = [each for topic, each in found if topic == "/link"]
+    kinds = [each["kind"] for each in steps]
+    assert kinds == ["program", "session", "sent", "report", "chunk", "sent"]
+    sent, report, chunk, again = steps[2:]
+    assert (sent["call"], sent["message"], again["call"], again["message"]) == (1, 0, 2, 1)
+    assert report["parts"] == sent["parts"] >= sent["needed"] == 1
+    assert (chunk["call"], chunk["message"], chunk["rows"]) == (1, 0, 10)
 
 
 def test_a_full_disk_stops_the_recording_alone(

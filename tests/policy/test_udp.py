@@ -71,6 +71,8 @@ def test_openpis_own_client_flies_through_both_commands(
     observed = [each for topic, each in recorded if topic == "/observation"]
     assert observed[1] == {"call": 2, "state": [5.0], "prompt": "go on"}
     assert policy.seen[0]["prompt"] == "go on"
+    assert main(["explain", str(tmp_path / "calls.mcap")]) == 0
+    assert "the robot end refused observations" in capsys.readouterr().out
 
 
 @pytest.mark.realtime
