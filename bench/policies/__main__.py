@@ -137,13 +137,12 @@ def tables(results: Sequence[Result]) -> dict[str, TextTable]:
         grouped.setdefault(result.cell[:3], []).append(result)
     made = {}
     for task in dict.fromkeys(key[0] for key in grouped):
-        systems = [key[2] for key in grouped if key[0] == task]
-        systems = [*dict.fromkeys(each for each in systems if each not in BOUNDS)]
-        networks = dict.fromkeys(key[1] for key in grouped if key[0] == task)
+        keys = [key for key in grouped if key[0] == task]
+        systems = [each for each in (*REAL, *VIRTUAL) if any(each == key[2] for key in keys)]
+        networks = [each for each in NETWORKS if any(each == key[1] for key in keys)]
         scores = [
             [network, *(_score(grouped.get((task, network, each), [])) for each in systems)]
             for network in networks
-            if network != OF_BOUNDS
         ]
         bounds = [
             f"{each} {_score(grouped[task, OF_BOUNDS, each])}"
@@ -154,9 +153,10 @@ def tables(results: Sequence[Result]) -> dict[str, TextTable]:
         title = f"{task}: {what}" + (f" (bounds: {', '.join(bounds)})" if bounds else "")
         made[title] = TextTable(["network", *systems], scores)
         figures = [
-            [network, system, *_figures(own)]
-            for (at, network, system), own in grouped.items()
-            if at == task and system in REAL
+            [network, system, *_figures(grouped[task, network, system])]
+            for network in networks
+            for system in REAL
+            if (task, network, system) in grouped
         ]
         if figures:
             head = ["network", "system", "runs", "freeze, median [s]", "longest [s]", "calls"]
@@ -232,7 +232,8 @@ def draw(results: Sequence[Result], out: Path) -> None:
     panels[-1, 0].set_xticks(range(len(networks)), networks, rotation=30, ha="right")
     panels[0, 0].legend(ncols=len(systems))
     figure.tight_layout()
-    figure.savefig(out, dpi=120)
+    with files.replacing(out) as file:
+        figure.savefig(file, format="png", dpi=120)
     plt.close(figure)
 
 
