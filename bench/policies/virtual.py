@@ -68,6 +68,7 @@ def fly_virtual(seconds: float | None, cell: Cell) -> Result:
         return networked(task, cell, seconds, ORACLE, has_rows=False)
     way = NETWORKS[cell.network]
     network: Options = {"uplink": way, "downlink": way, "thinking": task.thinking_s}
+    network["rows"] = task.calls
     return networked(task, cell, seconds, network, has_rows=bool(rows))
 
 

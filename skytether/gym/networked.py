@@ -13,6 +13,7 @@ no other clock.
 import math
 from collections.abc import Callable, Sequence
 from copy import deepcopy
+from functools import partial
 from numbers import Integral, Real
 from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
@@ -32,7 +33,7 @@ from skytether.netem.impairments.direction import Impairments, impairments
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.netem.link import QUEUE_BYTES_MAX
 from skytether.policy.form import PART_BYTES_MAX, PART_HEAD_BYTES
-from skytether.policy.players import Chunk, Clocked, Player, Row
+from skytether.policy.players import Batched, Chunk, Clocked, Player, Row
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import seconds_to_ns
@@ -82,6 +83,9 @@ class Options(TypedDict, total=False):
     after the last; by default zeros, or the action nearest to zeros."""
     player: Callable[[], Player]
     """Function that makes a `Player`, the robot's rule for choosing actions, for each episode."""
+    rows: int
+    """Number of actions that the robot executes of each answer, which later chunks do not change,
+    as of a program with `skytether policy join --rows`."""
     step_s: float | None
     """Length of a step [s]; None: 1 / `render_fps` of the environment."""
     clock_ns: Callable[[], int]
@@ -120,6 +124,7 @@ class _Far:
         exhausted: Exhausted = "hold",
         idle: Any = None,
         player: Callable[[], Player] = Clocked,
+        rows: int = 1,
         step_s: float | None = None,
         clock_ns: Callable[[], int] = perf_counter_ns,
         mtu: int = MTU,
@@ -154,6 +159,8 @@ class _Far:
             self._idle = self._one(idle_of(action) if idle is None else idle, "idle")
         except ValueError as error:
             raise ConfigError(str(error)) from None
+        if _whole("rows", rows, 1, ROWS_MAX) > 1:
+            player = partial(Batched, player, rows)
         self._exhausted, self._player, self._compress = exhausted, player, compress
         self._clock_ns, self._returned_ns = clock_ns, 0
         self._episode = 0

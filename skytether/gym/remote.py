@@ -269,7 +269,7 @@ class Remote:
         for robot, (made, chunk) in self._arrived(self.uplink):
             robot.player.accept(chunk, self.step)
             robot.acknowledged = chunk.generation
-            robot.delays.append(self.step - made)
+            robot.delays.append(self.step + len(robot.player.settled) - made)
 
     def _hear_robots(self) -> None:
         for robot, report in self._arrived(self.downlink):

@@ -10,6 +10,7 @@ A player stores only tuples, so that a shallow copy is a snapshot of its state.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from copy import copy
 from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
@@ -51,6 +52,9 @@ class Held(NamedTuple):
 
 class Player(ABC):
     """Rule that chooses the row to execute at each control step."""
+
+    settled: tuple[Row | None, ...] = ()
+    """Rows of the next steps that no chunk changes any more."""
 
     def __init__(self) -> None:
         self.held: tuple[Held, ...] = ()
@@ -96,6 +100,37 @@ class Clocked(Player):
                 self.last = rows[min(step - first, len(rows) - 1)]
                 return self.last if step - first < len(rows) else None
         return None
+
+
+class Batched(Player):
+    """Player of a program that executes `count` rows of each answer, as openpi's
+    `ActionChunkBroker`: a chunk that arrives meanwhile is used in the next answer.
+
+    Args:
+        make: function that makes the player by which the rows of an answer are chosen.
+    """
+
+    def __init__(self, make: Callable[[], Player], count: int) -> None:
+        super().__init__()
+        self._player, self._count = make(), count
+
+    def number(self, step: int) -> int:
+        return self._player.number(step)
+
+    def accept(self, chunk: Held, step: int) -> None:
+        self._player = copy(self._player)
+        self._player.accept(chunk, step)
+
+    def row(self, step: int) -> Row | None:
+        if not self.settled:
+            player = copy(self._player)
+            self.settled = tuple(player.row(step + i) for i in range(self._count))
+        self._player = copy(self._player)
+        self._player.row(step)  # it counts steps
+        (row, *_), self.settled = self.settled, self.settled[1:]
+        if row is not None or self.last is None:
+            self.last = self._player.last if row is None else row
+        return row
 
 
 class Newest(Player):

@@ -48,37 +48,51 @@ class Moving(gymnasium.Wrapper[Any, Any, Any, Any]):
         return outcome
 
 
-def evaluated(seed: int, steps: int, **options: Any) -> Moving:
-    """Run of the policy with `Networked`; its first chunk takes no thinking time."""
+def evaluated(seed: int, steps: int, *, knows: bool = True, **options: Any) -> Moving:
+    """Run of the policy with `Networked`; its first chunk takes no thinking time.
+
+    The policy answers every `rows` steps, and gets the committed rows if it `knows` them.
+    """
+    rows_each = options.get("rows", 1)
     world = Moving()
     env = Networked(world, step_s=TASK.step_s, idle=IDLE, **options)
     observation, info = env.reset(seed=seed)
     while len(world.actions) < steps:
         network = info["network"]
-        committed = network["committed"][: network["committed_rows"]]
+        if network["generation"] and len(world.actions) % rows_each:
+            observation, *_, info = env.step(None)
+            continue
+        committed = network["committed"][: network["committed_rows"] if knows else 0]
         rows = policy({"state": observation, "committed": committed})["actions"]
         is_first = network["generation"] == 0
         observation, *_, info = env.step(Chunk(rows, thought_ns=0) if is_first else rows)
     return world
 
 
-def deployed(seed: int, steps: int, thinking: float, way: str = "none") -> Moving:
-    """Run of the policy with `RobotEnd` and `PolicyEnd`, with a call at each step."""
+def deployed(
+    seed: int, steps: int, thinking: float, way: str = "none", rows: int = 1, *, knows: bool = True
+) -> Moving:
+    """Run of the policy with `RobotEnd` and `PolicyEnd`, with a call every `rows` steps.
+
+    Args:
+        knows: whether the policy gets the committed rows.
+    """
     world = Moving()
     observation, _ = world.reset(seed=seed)
-    options = RobotOptions("absolute", 1, step_ns=STEP_NS, plays_on=True)
+    options = RobotOptions("absolute", 1, step_ns=STEP_NS, rows=rows, plays_on=True)
     network = {"to_policy": way, "to_robot": way, "seed": seed}
-    ends = Emulated(policy, options, thinking=0.0, gives_rows=True, **network)  # type: ignore[arg-type]
+    ends = Emulated(policy, options, thinking=0.0, gives_rows=knows, **network)  # type: ignore[arg-type]
     ends.connect()
     while len(world.actions) < steps:
         try:
-            action = ends.infer({"state": observation})["actions"][0]
+            actions = ends.infer({"state": observation})["actions"][:rows]
         except NoActionError:
-            action = np.zeros(1, np.float32)
+            actions = np.zeros((rows, 1), np.float32)
         if not world.actions:
             began_ns, ends.thinking_ns = ends.now_ns, seconds_to_ns(thinking)
-        observation, *_ = world.step(action)
-        ends.run(began_ns + len(world.actions) * STEP_NS)
+        for action in actions:
+            observation, *_ = world.step(action)
+            ends.run(began_ns + len(world.actions) * STEP_NS)
     return world
 
 
@@ -87,6 +101,26 @@ def test_without_a_network_each_decision_is_that_of_the_deployed_ends(thinking: 
     expected = deployed(1, 150, thinking).actions
     assert evaluated(1, 150, thinking=thinking).actions == expected
     assert len(set(expected)) > 100
+
+
+def test_a_robot_that_executes_several_rows_of_each_answer_decides_as_the_deployed_ends() -> None:
+    assert evaluated(1, 150, rows=5).actions == deployed(1, 150, 0.0, rows=5).actions
+
+
+def test_with_several_rows_of_each_answer_scores_are_those_of_the_deployed_ends() -> None:
+    """A policy that ignores committed rows suffers more, the more rows a program executes."""
+    way, scores = "constant(50ms) & loss(5%)", list[list[float]]()
+    for seed in range(1, 9):
+        network = {"uplink": way, "downlink": way, "thinking": 0.02, "knows": False}
+        one, five = (evaluated(seed, 150, rows=rows, **network) for rows in (1, 5))
+        there = deployed(seed, 150, 0.02, way, 5, knows=False)
+        scores.append([sum(world.rewards[:150]) for world in (one, five, there)])
+    one, five, there = np.transpose(scores)
+    middle, half = interval(list(five - there))
+    assert middle is not None
+    assert half is not None
+    assert abs(middle) < max(half, 30.0)
+    assert (one - there).mean() > 3 * abs(middle)
 
 
 @pytest.mark.realtime
