@@ -41,6 +41,8 @@ NOT_MEASURED = {
     "docs/torture.md: The invariants": "bounds",
     "docs/triggers.md: Policies": "defaults",
     "docs/policy.md: Faults": "what faults are",
+    "docs/lerobot.md: Two commands": "defaults",
+    "docs/lerobot.md: How LeRobot finds the plug-in": "versions",
 }
 """Pages and sections with tables of numbers that are not measured, and what the numbers are."""
 TABLE = re.compile(r"(?:^\|.*\n)+", re.MULTILINE)
