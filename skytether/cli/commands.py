@@ -43,7 +43,7 @@ COMMANDS_IN_GROUPS = {
     },
     "After a flight": {
         "explain SCENARIO|FILE": (
-            "why a flight braked or went astray, or a robot held",
+            "why a flight braked or was far off, or a robot held",
             "skytether.explain.command:explain_flight",
         ),
         "replay FILE": (

@@ -18,7 +18,7 @@ CALLS = {"/answers", "/link", "/options"}
 
 
 def is_of_calls(path: Path) -> bool:
-    """Whether a recording is of calls of a robot program; raises CommandError as `opened`."""
+    """Whether a recording is one of `skytether policy join`; raises CommandError as `opened`."""
     try:
         with closing(Container(path)) as file, reading(path):
             return any(topic in CALLS for topic, *_ in islice(file.timed("json"), HEAD_MESSAGES))

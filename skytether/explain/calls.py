@@ -2,8 +2,9 @@
 
 A replay drives the robot end (`policy.robot.RobotEnd`) in virtual time, without a network. A call
 begins as long after the previous answer as in the recording, and its chunk arrives as long after
-the call. So the answers follow if a chunk had arrived, had more rows, or if the program had not
-paused. Rows have no values here, because the kind of an answer does not depend on them.
+the call. A changed replay shows the answers as if a chunk had arrived or had more rows, or as if
+the program had not paused. All rows are zeros, because the kind of an answer does not depend on
+them.
 """
 
 from collections.abc import Sequence
@@ -64,7 +65,7 @@ class Call:
     answered_ns: int
     kind: Kind
     is_asked: bool
-    """Whether its observation was to be sent; otherwise it was not needed, or was refused."""
+    """Whether its observation was to be sent; otherwise it was not needed, or it was refused."""
     sent_ns: int | None = None
     """Time at which the first part of its observation was sent; None: it was not sent."""
     parts: int = 0
@@ -72,12 +73,12 @@ class Call:
     reported_ns: int | None = None
     """Time of the policy end's report on the observation; None: no report has arrived."""
     came: int = 0
-    """Number of parts received, by this report."""
+    """Number of parts received, as this report says."""
     arrivals: list[Arrival] = field(default_factory=list)
 
     @property
     def chunk(self) -> Arrival | None:
-        """Its chunk or, without one, the error or refused chunk."""
+        """Chunk of this call; if none was accepted, the refused chunk or the error."""
         return min(self.arrivals, key=lambda each: each.step.kind != "chunk", default=None)
 
     @property
@@ -166,7 +167,7 @@ def _follow(
     programs: Sequence[Program],
     sessions: list[tuple[int, bool]],
 ) -> None:
-    """Assign the steps on the link to calls and programs."""
+    """Assign the events of the link to calls and sessions."""
     calls = {call.number: call for program in programs for call in program.calls}
     of_message = dict[int, int]()
     for time_ns, step in steps:
@@ -202,10 +203,7 @@ class Reply(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """Calls to be replayed.
-
-    The first call of a replay waits for its chunk, as the first call of a program.
-    """
+    """Calls to be replayed; the first waits for its chunk, as the first call of a program does."""
 
     options: RobotOptions
     calls: Sequence[Call]
@@ -213,9 +211,9 @@ class Replay:
     """Time from the previous answer to each call, or from the previous call if it was made before
     that answer [ns]."""
     replies: Sequence[Reply | None]
-    """Reply to each call; None: none arrives."""
+    """Reply to each call; None: no reply arrives."""
     refused: frozenset[int]
-    """Places of the calls whose observations are refused."""
+    """Indices of the calls whose observations are refused."""
 
     def answers(self) -> list[Kind]:
         """Kind of the answer to each call."""

@@ -38,8 +38,8 @@ class ExplainOptions:
     """A scenario's name (`skytether list scenarios`), a .toml file, or a recording (.mcap) of a
     flight in virtual time or over UDP, or of `skytether policy join`."""
     at: Annotated[float | None, Argument(metavar="T")] = None
-    """Time of flight of the moment to explain [s]; by default of the most severe moment. For calls
-    of a robot program: time since the start of the recording; by default of all gaps."""
+    """Time of flight of the moment to explain [s]; by default the most severe moment. For calls of
+    a robot program: time of the gap since the start of the recording; by default all gaps."""
     vehicle: Annotated[int | None, Argument(metavar="N")] = None
     """Number of the vehicle of the moment to explain; by default any vehicle."""
     seeds: Annotated[int, Argument(metavar="N")] = 0
@@ -66,8 +66,8 @@ def explain_flight(argv: Sequence[str]) -> None:
     A recorded flight over UDP is replaced by its double, which flies in virtual time. Ctrl-C prints
     the explanation so far.
 
-    For a recording of `skytether policy join`, the text gives for each gap, in which no row of the
-    policy remained, the cause, and what would have averted it: the recorded calls are replayed with
+    For a recording of `skytether policy join`, the text gives the cause of each gap, in which no
+    row of the policy remained, and what would have averted it: the recorded calls are replayed with
     the chunks that were lost, late or refused, with longer chunks and with another deadline.
     """
     if argv and argv[0].endswith(RECORDING):

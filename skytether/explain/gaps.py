@@ -1,18 +1,20 @@
-"""Explanation of the gaps of a robot program: times at which no row of the policy remained.
+"""Explanation of the gaps in the calls of a robot program: times without a row of the policy.
 
 Each call before and in a gap whose chunk is missing, late or refused is a *unit*, and so is each
 long pause of the program. A unit is repaired in a replay (`calls.Replay`): its chunk then arrives
 after the usual delay, with the usual number of rows, and a pause is as long as usual. The cause of
 a gap is the kind of units whose repair averts the gap.
 
-| observation | chunk | cause |
-|---|---|---|
-| no report, or an incomplete one | no chunk number is missing | lost on the way to the policy end |
-| any report, or none | as many chunk numbers are missing | lost on the way to the robot end |
-| reported complete | late, or no chunk number is missing | the policy was slow |
-| no report | no chunk afterwards | either way, or the policy end |
+| report | chunk | number of a chunk | cause |
+|---|---|---|---|
+| incomplete | none | | loss on the way to the policy end |
+| none | none | none is missing | loss on the way to the policy end |
+| complete or none | none | one is missing | loss on the way to the robot end |
+| complete | late or none | none is missing | the policy was slow |
+| none | none, and no later one | | loss in either direction, or the policy end stopped |
 
-The policy end numbers its chunks, so a number that is missing is a chunk that was sent and lost.
+The policy end numbers its chunks, so a missing number is a chunk that was sent and lost. If numbers
+are missing for only some calls of a run, the majority decides.
 """
 
 from collections import Counter
@@ -37,7 +39,7 @@ BEFORE, LENGTH_MAX = 64, 50
 FEW = 8
 """Smallest number of chunks before a gap whose medians are the usual ones."""
 LONG = 2
-"""Multiple of the usual time from which a pause, or the time between two chunks, is a unit."""
+"""Multiple of the usual pause or delay above which it is long."""
 RUNS_MAX = 8
 """Largest number of runs of calls that are listed."""
 ROWS_FACTOR, TIME_NS_MAX = 8, 10 * SECOND_NS
@@ -71,7 +73,7 @@ class Part(msgspec.Struct, frozen=True):
     cause: Cause
     evidence: str
     calls: tuple[int, ...]
-    """Calls of these units, from those directly before the first repaired one on."""
+    """Calls of these units: the repaired ones, those after, and those directly before."""
     repaired: tuple[int, ...]
     """Smallest set of calls whose repair averts the gap, together with the other parts."""
 
@@ -86,7 +88,7 @@ class Gap(msgspec.Struct, frozen=True):
     """Numbers of the calls answered with the hold action."""
     errors: tuple[int, ...]
     parts: tuple[Part, ...]
-    """Parts of the cause; with `is_any`, the repair of any one of them averts the gap."""
+    """Parts of the cause; if `is_any`, the repair of one of them averts the gap."""
     is_any: bool
     averting: tuple[str, ...]
     """Further changes with which there is no gap."""
@@ -188,7 +190,7 @@ class _Window:
         self._program, self._gap = program, calls[first:end]
         self._calls = calls[start : min(end, first + LENGTH_MAX)]
         self._places = range(first - start, len(self._calls))
-        """Places of the gap's calls in the replay."""
+        """Indices of the gap's calls in the replay."""
         self.replay = recorded(program, self._calls)
         end_of_usual = self._places.start if self._places.start >= FEW else None
         self._pause_ns = int(median(self.replay.pauses_ns[1:end_of_usual] or [0]))
@@ -258,7 +260,7 @@ class _Window:
             return None
         after_ns = _after_report(call, chunk)
         is_late = after_ns is not None and after_ns - self._usual(_after_report) > late_ns // 2
-        # The report of a neighbour shows whether the network is as late.
+        # Reports on calls nearby show whether the network was as late as the chunk.
         near = [each for each in self._calls if abs(each.number - call.number) <= 8]
         trips_ns = [trip for each in near if (trip := _trip(each)) is not None]
         varies_ns = max(trips_ns, default=0) - self._usual(lambda each, _: _trip(each))
@@ -281,15 +283,15 @@ class _Window:
         return self._way(call, before, after)
 
     def _way(self, call: Call, before: Arrival | None, after: Arrival) -> Cause:
-        """Where a chunk was lost between two arrivals of one session."""
+        """Cause of a missing chunk between two arrivals of one session."""
         first, missing = before.step.call if before else 0, self._missing(before, after)
         between = [each for each in self._near if first < each.number < after.step.call]
         between = [each for each in between if each.sent_ns is not None and not each.arrivals]
         complete = sum(each.came >= each.needed for each in between)
         if call.came < call.needed:
-            is_majority = LONG * (missing - complete) > len(between) - complete
+            is_majority = 2 * (missing - complete) > len(between) - complete
             return Cause.TO_ROBOT if is_majority else Cause.TO_POLICY
-        if LONG * missing > complete:
+        if 2 * missing > complete:
             return Cause.TO_ROBOT
         # While the policy computes, the policy end keeps only the newest observation.
         return Cause.SLOW
@@ -304,7 +306,7 @@ class _Window:
         )
 
     def _missing(self, before: Arrival | None, after: Arrival) -> int:
-        """Number of chunks sent between two arrivals that have not arrived."""
+        """Number of chunks that were sent between two arrivals, and have not arrived."""
         first = before.message if before else -1
         came = {each.message for each in self._arrivals if each.session == after.session}
         sent = range(first + 1, after.message)
@@ -449,7 +451,7 @@ def _trip(call: Call) -> int | None:
 
 
 def _least(values: Sequence[int], suffices: Callable[[int], bool]) -> int | None:
-    """Least of rising values that suffices, if larger values do, too; None if none does."""
+    """Least of increasing values that suffices, assuming that larger ones do, too; None: none."""
     low, high = 0, len(values)
     while low < high:
         middle = (low + high) // 2

@@ -87,8 +87,8 @@ class ServeOptions(EndOptions):
     patience: str = "30s"
     """Longest time for a reply of the policy server; after it, the connection is reopened."""
     give_rows: bool = False
-    """Add the robot's remaining rows to each observation, as keys delay_steps, coming and
-    committed."""
+    """Add the keys delay_steps, coming and committed to each observation: the rows that the robot
+    will execute, for a policy that continues them."""
 
 
 @dataclass(frozen=True)
@@ -98,8 +98,8 @@ class JoinOptions(EndOptions):
     server: Annotated[str, Argument(positional=True, metavar="HOST:PORT")] = ""
     """HOST:PORT of `skytether policy serve`."""
     actions: Literal["absolute", "delta", ""] = ""
-    """Type of the actions: absolute or delta. Required. The hold action, executed when no row
-    remains, is the last row for absolute actions, and zeros for delta actions."""
+    """Type of the actions; required. The hold action, executed when no row remains, is the last row
+    for absolute, and zeros for delta."""
     listen: str = "127.0.0.1:8000"
     """HOST:PORT to listen on for the robot program, which connects with openpi's client."""
     deadline: str = "150ms"
@@ -116,10 +116,11 @@ class JoinOptions(EndOptions):
     """Number of rows that the program executes of each answer: `action_horizon` of openpi's
     ActionChunkBroker. With a wrong number, rows are repeated or skipped when a chunk is late."""
     plays_on: bool = False
-    """Whether the robot continues to execute rows during a call. Requires --step."""
+    """Count rows as executed during calls, too, for a program that makes calls in a separate
+    thread. Requires --step."""
     when: str = "always"
-    """Observations that are sent: always sends each; needed(N) sends an observation only if fewer
-    than N rows will remain when its action chunk arrives, or fewer than --rows remain."""
+    """Which observations are sent: always, each; needed(N), only if fewer than N rows will remain
+    when the action chunk of the observation arrives, or if fewer than --rows remain."""
     merge: Literal["clock", "drtc"] = "clock"
     """Rule for a step with rows in several chunks: clock, the row of the newest chunk, where steps
     are counted by the clock; drtc, DRTC's rule, where steps are counted by executed rows."""
@@ -139,10 +140,11 @@ class JoinOptions(EndOptions):
     robot: Annotated[int, Argument(name="id")] = 1
     """Number of this robot and its key, 0 to 65535, unique at the server."""
     record: Path | None = None
-    """MCAP file for the recording, which Foxglove shows: observations with images, and answers."""
+    """MCAP file for a recording of observations with images, answers and events, which Foxglove and
+    `skytether explain` read."""
     page: str | None = None
     """HTTP address of a live page, as in 127.0.0.1:8080: answers, reasons for holds, network, and
-    images. Everybody who can reach the address can see them."""
+    images. Everybody who can reach the address can see the page."""
 
 
 def policy(argv: Sequence[str]) -> None:
@@ -290,7 +292,9 @@ def _shown(address: Address, options: JoinOptions) -> Iterator["CallPage"]:
 
 @contextmanager
 def _recorded(path: Path, options: RobotOptions) -> Iterator["CallRecording"]:
-    """Record calls to a file; if the disk fails, calls are answered and the command fails."""
+    """Record calls to a file. If the disk fails, calls are still answered, and the command fails at
+    the end.
+    """
     with extras.named("record"):
         from skytether.policy.recording import CallRecording
     try:

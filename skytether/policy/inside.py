@@ -54,7 +54,7 @@ def gate_of(keys: Path | str | None) -> Gate:
 
 
 def policy_end(gate: Gate, **options: Any) -> PolicyEnd:
-    """Policy end with random numbers of the operating system."""
+    """Policy end with the operating system's random numbers."""
     return PolicyEnd(
         gate,
         boot_id=secrets.randbits(63),
@@ -191,7 +191,8 @@ class Robot:
         server: HOST:PORT of `skytether policy serve`, or of `serve`.
         actions: type of the actions. If no row remains, the robot executes the last row again
             ("absolute"), or zeros ("delta").
-        deadline: longest time from a call to its answer, except for the first call [s].
+        deadline: longest time from a call to its answer, except for the first call, and the first
+            after a pause [s].
         step: length of a control step [s]; None: measured between the calls.
         rows: number of rows that the program executes of each answer.
         hold: longest time for which calls are answered with the hold action [s].
@@ -291,7 +292,8 @@ class Robot:
         try:
             return self._line.answers.get(timeout=self._patience_s)
         except queue.Empty:
-            raise PolicyError("no answer from the robot's end of the link") from None
+            missing = "answer of the robot end" if self._is_connected else "metadata of the policy"
+            raise PolicyError(f"no {missing} within {self._patience_s:g} s") from None
 
     def infer(self, observation: Any) -> Any:
         """Reply to an observation, from the present row on.

@@ -1,11 +1,11 @@
 """Send rate and packet loss ratio of one direction, estimated from the receiver's reports.
 
 Delay-based congestion control: the queueing delay is the one-way delay of a message's last part
-minus the minimum of the last LEAST_NS. A message counts as delayed if its queueing delay exceeds
-the jitter of its delay, which no send rate changes. If more than QUEUE_HIGH_NS remain, and the path
-has received the last messages at no more than the send rate, the send rate is reduced below the
-received rate, so that the queue becomes empty within about a second. Below QUEUE_LOW_NS the send
-rate is raised if it limited the sender. Loss alone does not reduce the send rate, because on radio
+minus the minimum of the last LEAST_NS. The jitter of the delay is subtracted, because a lower send
+rate does not reduce it. If more than QUEUE_HIGH_NS remain, and the last messages were received no
+faster than the send rate, the send rate is reduced below the received rate, so that the queue
+becomes empty within about a second. Below QUEUE_LOW_NS the send rate is raised if it limited the
+sender. Loss alone does not reduce the send rate, because on radio
 links loss does not imply a queue. Compare LEDBAT (RFC 6817), NADA (RFC 8698) and Google's
 congestion control.
 
@@ -30,8 +30,8 @@ QUEUE_HIGH_NS, QUEUE_LOW_NS = 40 * MILLISECOND_NS, 15 * MILLISECOND_NS
 """Queueing delay without jitter above which the send rate is reduced, and below which the rate is
 raised [ns]."""
 JITTERS, JITTER_GAIN = 2.0, 0.125
-"""Queueing delay that counts as jitter, in mean changes of the delay from message to message, and
-filter gain of this mean."""
+"""Part of the queueing delay that counts as jitter, as a multiple of the mean change of the delay
+from message to message, and filter gain of this mean."""
 JITTER_MAX_NS = 80 * MILLISECOND_NS
 """Largest change of the delay that counts as jitter, not as a queue that fills [ns]."""
 LOWERED_EVERY_NS = 200 * MILLISECOND_NS
@@ -47,7 +47,7 @@ PARTS_MIN = 6
 """Smallest number of received parts whose rate counts as the rate of the path."""
 RECEIVED, RECEIVED_SHARE = 3, 1.1
 """Number of newest received rates of which the largest is compared with the send rate, and the
-smallest ratio of the two at which the path is faster than the send rate."""
+smallest ratio of the two at which messages count as received faster than the send rate."""
 LOSS_FIRST, LOSS_MAX = 0.02, 0.4
 """Packet loss ratio assumed before the first report, and largest estimate."""
 GAIN_UP, GAIN_DOWN = 0.3, 0.05

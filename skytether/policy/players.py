@@ -82,7 +82,7 @@ class Player(ABC):
 
 
 class Clocked(Player):
-    """Player that executes, at each step, the row of the newest chunk that has begun.
+    """Player that executes the row of the newest chunk whose first row is not for a later step.
 
     When this chunk ends, no row of an older chunk follows: a policy whose plan ends early stops.
     """

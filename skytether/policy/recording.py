@@ -34,7 +34,8 @@ from skytether.shared.events.flight import Event
 from skytether.shared.formats import foxglove
 
 VALUES_MAX = 256
-"""Largest number of elements of an array in `/observation`; of a larger one the shape is given."""
+"""Largest number of elements of an array in `/observation`; of larger arrays only type and shape
+are recorded."""
 ACTIONS_MAX = 16_384
 """Largest number of elements of the actions in `/answers`."""
 WAITING_MAX = 192
@@ -85,7 +86,7 @@ class CallRecording:
         self._put(partial(self._add_call, call))
 
     def step(self, now_ns: int, step: LinkStep) -> None:
-        """Record a step of a call on the link."""
+        """Record an event of the link."""
         self._put(partial(self._add_step, now_ns, step))
 
     def hear(self, event: Event) -> None:
@@ -98,13 +99,15 @@ class CallRecording:
             self._waiting.put(None, timeout=CLOSING_S)
         self._thread.join(CLOSING_S)
         if self._thread.is_alive():
-            return f"{self._growing.at}: the disk has not taken the end within {CLOSING_S:g} s"
+            return f"{self._growing.at}: the end was not written within {CLOSING_S:g} s: slow disk"
         try:
             self._growing.end(empty=not self._channels.numbers, whole=not self._fault)
         except OSError as error:
             self._fault = f"cannot be completed: {error.strerror}"
         if self._missed and not self._fault:
-            self._fault = f"{self._missed} messages are missing: slow disk, or a value has no JSON"
+            self._fault = (
+                f"{self._missed} messages are missing: slow disk, or values that JSON cannot hold"
+            )
         return f"{self._growing.at}: {self._fault}" if self._fault else ""
 
     def _put(self, action: Callable[[], None]) -> None:

@@ -82,12 +82,12 @@ class AnsweredCall(NamedTuple):
 
 
 class LinkStep(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Event on the way of calls to the policy end and back, for `skytether explain`."""
+    """Event of the link to the policy end, recorded for `skytether explain`."""
 
     kind: str
-    """`program`: a program connects; `session`, or `restart` with a new run of the policy end;
-    `sent`: the first part of an observation; `report`: of the policy end on received parts;
-    `chunk`, or `refused`: an action chunk; `error`: of the policy."""
+    """`program`: a program connects; `session`: a session begins, `restart` if with a new run of
+    the policy end; `sent`: the first part of an observation is sent. What arrives: `report`, on an
+    observation; `chunk`, `refused` if it is not used; `error`, of the policy."""
     call: int = -1
     message: int = -1
     """Number of the message in its stream and session."""
@@ -106,7 +106,7 @@ class RobotOptions:
 
     actions: Actions
     deadline_ns: int
-    """Longest time from a call to its answer, except for the first call [ns]."""
+    """Longest time from a call to its answer, except for first calls, see the module [ns]."""
     hold_ns: int = SECOND_NS
     """Longest time for which calls are answered with the hold action [ns]."""
     begin_ns: int = 60 * SECOND_NS
@@ -162,8 +162,8 @@ class _Call:
 
 @dataclass(slots=True)
 class _SinceChunk:
-    """Events since the newest chunk or, without a chunk, since the program connected, from which
-    the reason for a hold follows.
+    """Events from which the reason for a hold follows: since the newest chunk or, without a chunk,
+    since the program connected.
     """
 
     first: int = 0
@@ -188,7 +188,7 @@ class _Program:
     asked: dict[int, _Call] = field(default_factory=dict)
     """Calls whose observation was sent, by number."""
     newest: int = -1
-    """Number of the newest call whose chunk has arrived; -1: none."""
+    """Number of the newest call whose chunk has been accepted; -1: none."""
     made_ns: int = -1
     """Time of the call `newest` [ns]."""
     has_metadata: bool = False
@@ -226,7 +226,7 @@ class RobotEnd(Endpoint):
         self._robot, self._options, self._compress = robot, options, compress
         self._on_answer, self._on_step = on_answer, on_step
         self._begun = -1
-        """Number of the newest observation's message in this session of which parts were sent."""
+        """Number of this session's newest observation message of which parts were sent."""
         self._session = Session(self, robot, servers, link, boot_id, options.rate_max)
         self._program: _Program | None = None
         self._calls = 0
@@ -443,7 +443,7 @@ class RobotEnd(Endpoint):
             self._answer(program, call, Kind.FRESH, now_ns)
 
     def _note(self, kind: str, call: int, now_ns: int, **content: Any) -> None:
-        """Pass on a step of the chunk or error that has just arrived."""
+        """Call `on_step` for the chunk or error that has just arrived."""
         exchange = self._session.exchange
         number = exchange.newest(CHUNK) if exchange else -1
         self._on_step(now_ns, LinkStep(kind, call, number, **content))
@@ -512,7 +512,7 @@ class RobotEnd(Endpoint):
             return "the newest chunk has arrived after the time of its last row"
         reached = min(len(since.reported), since.sent)  # a first observation is sent repeatedly
         counts = f"{reached} of the last {since.sent} observations"
-        return f"by its reports {counts} have reached `policy serve`, but no chunk has arrived here"
+        return f"`policy serve` has reported {counts}, but no chunk has arrived"
 
     # -- time ----------------------------------------------------------------------------------
 

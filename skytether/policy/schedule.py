@@ -25,8 +25,8 @@ from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 ROWS_MAX = 1024
 """Largest number of rows of a chunk."""
 STEP_NS_FIRST = 200 * MILLISECOND_NS
-"""Assumed length of a control step before it is measured [ns]. What a step takes longer counts as a
-pause until three intervals have been measured."""
+"""Assumed length of a control step before it is measured [ns]. Until three intervals have been
+measured, the time by which a step is longer counts as a pause."""
 STEP_NS_LEAST, STEP_NS_MOST = MILLISECOND_NS, SECOND_NS
 """Bounds of the measured step length [ns]: a pause of the program is not a long step."""
 MEASURED = 9

@@ -529,7 +529,7 @@ def broken_line(seen: Any) -> Any:
 @pytest.mark.parametrize(
     ("options", "cut", "pause_s", "reason"),
     [
-        ({}, True, 0.0, "by its reports 0 of the last 2 observations have reached"),
+        ({}, True, 0.0, "`policy serve` has reported 0 of the last 2 observations"),
         ({"policy": long_ramp}, True, 0.0, "no datagram from `policy serve` for 1.9 s"),
         ({"policy": broken_line}, False, 0.0, "error of the policy: RuntimeError: no memory"),
         ({}, True, 0.9, "the program made no call for 0.80 s"),
@@ -585,7 +585,7 @@ def test_a_hold_because_of_a_slow_policy_says_what_has_arrived() -> None:
     lab.thinking_ns = None
     fly(lab, 8, position)
     (why,) = holds_because(lab)
-    assert why.startswith("by its reports 2 of the last 2 observations have reached")
+    assert why.startswith("`policy serve` has reported 2 of the last 2 observations")
 
 
 def test_a_hold_because_chunks_are_later_than_their_rows_says_so() -> None:

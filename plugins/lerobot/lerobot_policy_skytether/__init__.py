@@ -1,8 +1,8 @@
 """LeRobot policy that is computed on another machine: `--policy.type=skytether`.
 
-LeRobot imports this package because of its name. Of a policy type, LeRobot looks up by name the
-configuration, the policy, and the function that makes the processors: `SkytetherConfig`,
-`SkytetherPolicy` and `make_skytether_pre_post_processors` (`lerobot/policies/factory.py`).
+LeRobot imports this package because of its name, and finds three objects by their names (see
+`lerobot/policies/factory.py`): the configuration, `SkytetherConfig`, the policy, `SkytetherPolicy`,
+and the function that makes the processors, `make_skytether_pre_post_processors`.
 """
 
 import logging
@@ -28,7 +28,7 @@ logger = logging.getLogger(__name__)
 @PreTrainedConfig.register_subclass("skytether")
 @dataclass
 class SkytetherConfig(PreTrainedConfig):
-    """Options of `policy.Robot`, as `--policy.server=gpu.example:47010` and so on."""
+    """Options of `policy.Robot`, given as `--policy.server=gpu.example:47010` and so on."""
 
     server: str = ""
     actions: str = ""
@@ -110,7 +110,7 @@ class SkytetherPolicy(PreTrainedPolicy):
 
 
 def make_skytether_pre_post_processors(*_: Any, **__: Any) -> tuple[Any, Any]:
-    """Processors without steps: the policy end has those of its policy."""
+    """Processors without steps: those of the policy run at the policy end."""
     return PolicyProcessorPipeline(steps=[]), PolicyProcessorPipeline(
         steps=[],
         to_transition=policy_action_to_transition,

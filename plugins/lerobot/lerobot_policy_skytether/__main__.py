@@ -43,8 +43,8 @@ def load(path: str, device: str | None = None) -> Callable[[dict[str, Any]], Any
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("path", help="folder of the policy, or its name on the Hugging Face Hub")
-parser.add_argument("--bind", default="127.0.0.1:47010", help="HOST:PORT for robots")
-parser.add_argument("--keys", help="file of `skytether keygen`")
+parser.add_argument("--bind", default="127.0.0.1:47010", help="HOST:PORT to listen on for robots")
+parser.add_argument("--keys", help="file with the keys, made by `skytether keygen`")
 parser.add_argument("--device", help="device of PyTorch; default: the policy's own")
 
 if __name__ == "__main__":
