@@ -2,8 +2,8 @@
 
     PATH=LEROBOT/bin:$PATH python -m bench.lerobots
 
-LeRobot's environment LEROBOT needs LeRobot with the extra `async`, and `skytether[policy]`. The
-robot only records its actions, and the policy is an ACT with random weights.
+LEROBOT is a Python environment with LeRobot, its extra `async`, and `skytether[policy]`. The robot
+only records its actions, and the policy is an ACT with random weights.
 """
 
 import os
@@ -68,7 +68,7 @@ class Trial:
         ours = ("-m", "lerobot_policy_skytether", str(self.policy), f"--bind=127.0.0.1:{port}")
         server = self.start(self.python, *(own if who == OWN else ours))
         try:
-            while who == OWN:  # its robot client does not connect again
+            while who == OWN:  # its robot client does not try again to connect
                 with suppress(OSError), socket.create_connection(("127.0.0.1", port)):
                     break
                 time.sleep(0.1)
@@ -111,7 +111,7 @@ class Trial:
 
 
 def measured(trial: Trial, who: str, seed: int | None) -> list[float]:
-    """Times of the actions since the first [s]; without a seed, the network is perfect."""
+    """Times of the actions since the first [s]; without a seed, there is no bad network."""
     network, outage = ("none", "none") if seed is None else (NETWORK, "loss(100%)")
     port = 47_020
     with (

@@ -17,7 +17,7 @@ Rows = NDArray[np.float64]
 
 
 class Pendulum:
-    """Pendulum-v1, with gusts: swung up by its energy, held by a linear law."""
+    """Pendulum-v1 with gusts, swung up by its energy, and held by a linear law."""
 
     title, step_s, thinking_s, steps = "Pendulum-v1", 0.05, 0.05, 200
     tolerance = 0.4

@@ -1,13 +1,13 @@
 """Benchmark of a policy on another machine: openpi's client and server alone, LeRobot's and DRTC's
 rules, and `skytether policy`.
 
-Over real UDP and TCP the robot program, and `policy join`, run within `skytether netem run`; the
-policy server and `policy serve` run on this machine. TCP has Linux at both ends, see
+Over real UDP and TCP, the robot program and `policy join` run within `skytether netem run`; the
+policy server and `policy serve` run beside it. TCP has Linux at both ends, see
 `bench.policies.wire`. The systems are described in `bench.policies.robot`. In virtual time, the
 same policies run with `skytether.policy.virtual.Emulated` and `skytether.gym.Networked`. Bounds:
 `oracle`, a chunk at each step without delay, and `nothing sent` after the first chunk.
 
-A run of `--out FOLDER` that was interrupted with Ctrl-C is continued by the same command.
+After Ctrl-C, the same command with the same `--out FOLDER` continues.
 """
 
 import os

@@ -26,7 +26,7 @@ PAUSE_S = 0.001
 
 
 class Meter:
-    """CPU time of servers, divided among the robots that they serve at a time."""
+    """CPU time of servers, divided among the robots that are served at the same time."""
 
     def __init__(self) -> None:
         self._lock, self._active, self._used = (
@@ -58,7 +58,7 @@ class Meter:
 
 
 class Pauses(threading.Thread):
-    """Thread that sleeps 1 ms at a time, and records by how much it wakes late."""
+    """Thread that sleeps for 1 ms repeatedly, and records by how much it wakes late."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -78,7 +78,7 @@ class Pauses(threading.Thread):
 
 @dataclass
 class Servers:
-    """Policy servers and ends of `policy serve`, and what they share."""
+    """Policy servers and `policy serve` processes, and what their runs share."""
 
     ports: dict[tuple[str, str], int] = field(default_factory=dict)
     """UDP port by task and system."""
@@ -87,11 +87,11 @@ class Servers:
     pauses: Pauses = field(default_factory=Pauses)
     numbers: Iterator[int] = field(default_factory=lambda: itertools.count(1))
     running: set["subprocess.Popen[bytes]"] = field(default_factory=set)
-    """Runs, which are ended with the servers."""
+    """Processes of runs, which end with the servers."""
 
     def run(self, line: Sequence[str], patience_s: float) -> bytes:
         """Output of a command; raises SubprocessError with its errors."""
-        # A session of its own: Ctrl-C ends this command, which then ends the runs.
+        # In a new session, Ctrl-C reaches only this process, which then ends the runs.
         with subprocess.Popen(
             line,
             stdin=subprocess.DEVNULL,
@@ -137,7 +137,7 @@ def serving(cells: Sequence[Cell]) -> Iterator[Servers]:
 
 @contextmanager
 def process(line: Sequence[str]) -> Iterator[tuple[str, int]]:
-    """Run a command; its first line, and its process."""
+    """Run a command; yields the first line of its output, and its process ID."""
     with subprocess.Popen(
         line, stdout=subprocess.PIPE, text=True, start_new_session=True
     ) as running:
@@ -170,7 +170,7 @@ def fly_real(servers: Servers, seconds: float | None, cell: Cell) -> Result:
             return Result(cell, None, str(error))
         stack.close()
         counts = json.loads(counted.read_text())
-    # The wire's own headers are none of TCP.
+    # TCP without the wire has no headers of the wire.
     extra = 0 if server else HEADER_BYTES
     sent, received = (
         counts[way]["bytes"] - extra * counts[way]["packets"]

@@ -1,17 +1,17 @@
-"""Robot programs: what each system makes of the same policy.
+"""Robot programs of the compared systems, which use the same policies.
 
     openpi      openpi's client: a call waits for its answer, and rows are executed between calls
     lerobot     LeRobot's asynchronous inference: a queue of rows, averaged with those of new
                 chunks; observations are sent while at most half of a chunk is left; the last target
                 stays while the queue is empty
     drtc        DRTC: the newest row of each step; an observation is sent if a quarter of a chunk
-                was executed, and the chunk of the one before should have come; it has the rows that
-                will be executed meanwhile, for the policy to keep
+                was executed, and the chunk of the last observation is overdue; the policy keeps the
+                rows that are executed meanwhile, which are sent with the observation
     ours        openpi's client with `policy join` and `policy serve`
     ours-rows   the same with `--give-rows`: the policy keeps the committed rows
 
-`lerobot` and `drtc` are made from public descriptions. They send raw images and wait for no answer:
-threads send the newest observation, and receive chunks.
+`lerobot` and `drtc` are implemented from public descriptions. They send raw images, and do not wait
+for answers: threads send the newest observation, and receive chunks.
 
 `python -m bench.policies.robot JSON` runs one of them over a real network, within `skytether netem
 run`, and prints its figures.
@@ -49,7 +49,7 @@ GATEWAY = "10.0.2.2"
 """Address of this machine within `netem run`."""
 JOIN = (sys.executable, "-P", "-m", "skytether", "policy", "join")
 DELAYS = 16
-"""Number of newest chunks that DRTC's delay bound is the largest delay of."""
+"""Number of newest chunks whose largest delay is DRTC's delay bound."""
 
 
 class RobotRun(msgspec.Struct, frozen=True):
@@ -62,7 +62,7 @@ class RobotRun(msgspec.Struct, frozen=True):
     port: int
     """UDP port of the wire or of `policy serve`."""
     number: int
-    """Number of the robot, not used before."""
+    """Number of the robot, new for each run."""
 
 
 class Late(NamedTuple):
@@ -88,7 +88,7 @@ class Flown(msgspec.Struct, frozen=True):
     """Longest wait for an answer [s]."""
     late: list[Late]
     woke_late_s: float = 0.0
-    """Longest time by which the program woke late from a sleep [s]: the machine's own pauses."""
+    """Longest time by which the program woke late from a sleep, by pauses of the machine [s]."""
     cpu_s: float = 0.0
     """CPU time of the program, without the simulation of the robot, and of `policy join` [s]."""
 
@@ -111,7 +111,7 @@ class Real:
     """Real clock and openpi's client.
 
     Args:
-        others: other processes at the robot's end.
+        others: process IDs of the other processes on the robot.
     """
 
     def __init__(self, url: str, others: Sequence[int]) -> None:
@@ -207,21 +207,21 @@ def flown(
 
 
 class Rule(Protocol):
-    """Rule by which a queueing program sends observations."""
+    """Rule that decides when `queueing` sends an observation."""
 
     def is_due(self, step: int, left: int) -> bool:
-        """Whether an observation is sent at a step with so many rows left."""
+        """Whether an observation is sent at a step at which `left` rows remain."""
 
     def arrived(self, steps: int) -> None:
-        """Learn that a chunk has arrived so many steps after its observation."""
+        """Note that a chunk has arrived `steps` after its observation."""
 
     @property
     def committed(self) -> int:
-        """Number of next rows that the observation has."""
+        """Number of next rows that are sent with the observation."""
 
 
 class AtHalf:
-    """LeRobot's: observations are sent while at most half of a chunk is left."""
+    """LeRobot's rule: observations are sent while at most half of a chunk is left."""
 
     committed = 0
 
@@ -235,7 +235,7 @@ class AtHalf:
 
 
 class Cooldown:
-    """DRTC's: a quarter of a chunk was executed, and the chunk of the one before is overdue."""
+    """DRTC's rule: a quarter of a chunk was executed, and the last requested chunk is overdue."""
 
     def __init__(self, rows: int) -> None:
         self._rows, self._ready, self._delays = rows, 0, deque[int](maxlen=DELAYS)
@@ -255,7 +255,7 @@ class Cooldown:
 
 
 class Threads:
-    """Connection to a policy server on which nothing waits."""
+    """Connection to a policy server; sending and receiving do not block the program."""
 
     def __init__(self, url: str) -> None:
         self._socket = connect(url, compression=None, max_size=None)
@@ -286,7 +286,7 @@ class Threads:
 def queueing(
     threads: Threads, task: Task, plant: Plant, seconds: float, player: Player, rule: Rule
 ) -> Flown:
-    """Program that executes a row at each step, and asks for chunks beside."""
+    """Program that executes a row at each step, and does not wait for chunks."""
     threads.ask({**plant.observation, "number": 0})
     asked = {0: (0, 0)}  # of each observation: its step, and the number of its first row
     while not threads.arrived:

@@ -1,9 +1,9 @@
 """Policy server of a task: `python -m bench.policies.servers TASK`.
 
-The server speaks openpi's protocol on this machine's loopback, for `policy serve`, and on a wire
-for programs that use TCP. It takes the computation time of the policy for each observation. Of the
-observations that arrive meanwhile it keeps only the newest, as LeRobot's and DRTC's servers do; a
-client of openpi sends none meanwhile.
+The server uses openpi's protocol on this machine's loopback, for `policy serve`, and on a wire for
+programs that use TCP. Each reply takes the computation time of the policy. Of the observations that
+arrive meanwhile, only the newest is kept, as by LeRobot's and DRTC's servers; openpi's client sends
+none meanwhile.
 """
 
 import asyncio

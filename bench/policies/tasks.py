@@ -23,7 +23,7 @@ SIDE, SCALE = 96, 512 / 96
 PUSHER, BLOCK = np.array([65.0, 105.0, 225.0]), np.array([119.0, 136.0, 153.0])
 """Colours of the pusher and of the block."""
 NEAR, FAINT = 90.0, 0.4
-"""Distance of a colour at which a pixel is nothing like it, and likeness that does not count: the
+"""Difference of colours at which the likeness is 0, and likeness below which a pixel counts as
 noise of JPEG."""
 REACH = 95.0
 """Largest distance of a pixel of the block from its centre [px]."""
@@ -100,7 +100,7 @@ TASKS = {
 
 
 class Robot(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Environment whose actions have a serial number; it does not move before its first row."""
+    """Environment whose actions have a serial number; it does not move before the first row."""
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
         super().__init__(env)

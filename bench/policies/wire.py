@@ -35,14 +35,15 @@ def robot_address(number: int) -> str:
 
 
 def lay(address: str, sock: socket.socket, peers: dict[str, Address]) -> None:
-    """Move this process to a network namespace of its own, and carry its packets by `sock`.
+    """Move this process to a new network namespace, whose packets a child process sends by `sock`.
 
-    A child process carries the packets, so that the CPU time of this process does not include that.
+    The CPU time of this process does not include the child's.
 
     Args:
         address: address of this process on the wire.
-        sock: UDP socket in the namespace of before.
-        peers: where the packets for an address on the wire are sent; others are learned.
+        sock: UDP socket, made in the previous namespace.
+        peers: UDP address to which packets for each address on the wire are sent; further ones are
+            learned from received packets.
     """
     flags = _NEWNET if os.geteuid() == 0 else _NEWNET | _NEWUSER
     if system.LIBC.unshare(flags):
