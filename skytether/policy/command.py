@@ -119,7 +119,7 @@ class JoinOptions(EndOptions):
     """Count rows as executed during calls, too, for a program that makes calls in a separate
     thread. Requires --step."""
     when: str = "always"
-    """Which observations are sent: always, each; needed(N), only if fewer than N rows will remain
+    """Which observations are sent. always: each; needed(N): only if fewer than N rows will remain
     when the action chunk of the observation arrives, or if fewer than --rows remain."""
     merge: Literal["clock", "drtc"] = "clock"
     """Rule for a step with rows in several chunks: clock, the row of the newest chunk, where steps

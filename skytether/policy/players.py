@@ -54,7 +54,7 @@ class Player(ABC):
     """Rule that chooses the row to execute at each control step."""
 
     settled: tuple[Row | None, ...] = ()
-    """Rows of the next steps that no chunk changes any more."""
+    """Rows of the next steps that later chunks do not change."""
 
     def __init__(self) -> None:
         self.held: tuple[Held, ...] = ()
@@ -103,11 +103,12 @@ class Clocked(Player):
 
 
 class Batched(Player):
-    """Player of a program that executes `count` rows of each answer, as openpi's
+    """Player of a program that executes several rows of each answer, as openpi's
     `ActionChunkBroker`: a chunk that arrives meanwhile is used in the next answer.
 
     Args:
-        make: function that makes the player by which the rows of an answer are chosen.
+        make: function that makes the player that chooses the rows of an answer.
+        count: number of rows that the program executes of each answer.
     """
 
     def __init__(self, make: Callable[[], Player], count: int) -> None:
@@ -126,7 +127,7 @@ class Batched(Player):
             player = copy(self._player)
             self.settled = tuple(player.row(step + i) for i in range(self._count))
         self._player = copy(self._player)
-        self._player.row(step)  # it counts steps
+        self._player.row(step)  # some players count these calls
         (row, *_), self.settled = self.settled, self.settled[1:]
         if row is not None or self.last is None:
             self.last = self._player.last if row is None else row

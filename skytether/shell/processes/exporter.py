@@ -46,11 +46,11 @@ FRESH_S = 3.0
 OK, JSON = "200 OK", "application/json"
 Answer = tuple[str, str, bytes]
 """Status, type and content of an answer."""
-BY_NAME = b"Host: expected a number, localhost, a name without a dot or that of --metrics\n"
+BY_NAME = b"Host: expected an IP address, localhost, a name without a dot, or the bound name\n"
 
 
 class MetricsError(OSError):
-    """Listening at the metrics' address failed; the message has the address and the reason."""
+    """Listening at an address failed; the message gives the reason."""
 
 
 class Collected(Collector):
