@@ -94,7 +94,7 @@ class Schedule:
         """First step without a row in the program's last answer; later chunks do not change it."""
         self._reply: Any = None
         self._dtype: np.dtype[Any] = np.dtype(np.float64)
-        """Type that has all numbers of the received chunks."""
+        """Type that holds the numbers of all received chunks."""
         self._answered: tuple[int, list[Row]] = 0, []
         """Step and rows of the program's newest answer with rows."""
         self._last: Row | None = None
