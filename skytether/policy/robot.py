@@ -167,11 +167,11 @@ class _SinceChunk:
     """
 
     first: int = 0
-    """Number of the first message with an observation since then."""
+    """Number of the first message with an observation since then, or after the newest report."""
     sent: int = 0
     """Number of observations sent."""
-    reported: set[int] = field(default_factory=set)
-    """Numbers of their messages of which the policy end has reported parts."""
+    reported: int = 0
+    """Number of their messages of which the policy end has reported parts."""
     fault: str = ""
     """Newest error of the policy, or reason for refusing a chunk."""
 
@@ -186,7 +186,7 @@ class _Program:
     call: _Call | None = None
     """Call that is not answered yet."""
     asked: dict[int, _Call] = field(default_factory=dict)
-    """Calls whose observation was sent, by number."""
+    """Calls whose observation was sent and whose chunk has not arrived, by number."""
     newest: int = -1
     """Number of the newest call whose chunk has been accepted; -1: none."""
     made_ns: int = -1
@@ -277,7 +277,8 @@ class RobotEnd(Endpoint):
         if isinstance(heard, Report):
             self._on_step(now_ns, LinkStep("report", message=heard.number, parts=heard.came))
             if program and heard.number >= program.since.first:
-                program.since.reported.add(heard.number)
+                program.since.first = heard.number + 1
+                program.since.reported += 1
         elif heard:
             self._accept(heard, now_ns)
         self._greet()
@@ -368,7 +369,7 @@ class RobotEnd(Endpoint):
         program.since.sent += 1
         self._ask(call, now_ns)
         before = program.asked.get(call.number - 1)
-        if before and program.newest < call.number - 1:  # that call's chunk has not arrived
+        if before:
             self._waits &= now_ns - before.began_ns <= options.deadline_ns
         if left and not (self._waits or is_first):
             self._answer(program, call, Kind.REST, now_ns)
@@ -418,14 +419,17 @@ class RobotEnd(Endpoint):
             return
         schedule, delay_ns = program.schedule, now_ns - asked.began_ns
         self._waits = delay_ns <= self._options.deadline_ns
+        # The robot stands until the first call, also of an episode, is answered.
+        is_awaited = asked is call and asked.is_first and now_ns <= asked.answer_by_ns
+        stood_ns = None if is_awaited else asked.stood_ns
         try:
-            stood_ns = asked.stood_ns
             schedule.accept(call_number, asked.first, stood_ns, reply, now_ns=now_ns)
         except ValueError as refused:
             self._events.append(events.ChunkRefused(robot=self._robot, reason=str(refused)))
             program.since.fault = f"its chunk is refused: {refused}"
             self._note("refused", call_number, now_ns, fault=str(refused))
             return
+        del program.asked[call_number]  # a first observation, sent repeatedly, may get it again
         self._note("chunk", call_number, now_ns, rows=len(rows_of(reply, self._options.key)))
         if program.answers_first:
             self._delays.clear()  # the policy may have compiled before its first chunk
@@ -510,7 +514,7 @@ class RobotEnd(Endpoint):
             return f"no datagram from `policy serve` for {silence_ns / SECOND_NS:.1f} s"
         if not since.sent:
             return "the newest chunk has arrived after the time of its last row"
-        reached = min(len(since.reported), since.sent)  # a first observation is sent repeatedly
+        reached = min(since.reported, since.sent)  # a first observation is sent repeatedly
         counts = f"{reached} of the last {since.sent} observations"
         return f"`policy serve` has reported {counts}, but no chunk has arrived"
 

@@ -127,11 +127,11 @@ class Schedule:
         self._stands = True
 
     def has_paused(self, least_ns: int, *, now_ns: int) -> bool:
-        """Whether the program has made no call for `least_ns` since its last row."""
+        """Whether, for `least_ns`, no row has remained and the program has made no call."""
         ended_ns, answered_ns = self.since_ns, self._answered_ns
-        if ended_ns is None or answered_ns is None or answered_ns > ended_ns:
+        if ended_ns is None or answered_ns is None:
             return False
-        return now_ns - ended_ns > least_ns
+        return now_ns - max(ended_ns, answered_ns) > least_ns
 
     def go(self, *, now_ns: int) -> None:
         """Continue the step counter when the program gets its answer."""
@@ -189,13 +189,16 @@ class Schedule:
         """Number of the present step as the player counts steps; a chunk begins with this step."""
         return self._player.number(self.advance(now_ns=now_ns))
 
-    def accept(self, call: int, first: int, stood_ns: float, reply: Any, *, now_ns: int) -> None:
+    def accept(
+        self, call: int, first: int, stood_ns: float | None, reply: Any, *, now_ns: int
+    ) -> None:
         """Accept a chunk.
 
         Args:
             call: number of the call that the chunk answers; numbers increase.
             first: number of the step of the chunk's observation, see `number`.
-            stood_ns: `stood_ns` at the time of the chunk's observation [ns].
+            stood_ns: `stood_ns` at the time of the chunk's observation [ns]; None: the robot has
+                stood since then, so that the chunk is not late.
             reply: the policy's reply.
 
         Raises:
@@ -210,8 +213,8 @@ class Schedule:
                 raise ValueRefused(
                     f"{self._key}: got row shape {rows.shape[1:]}, expected {before} as before"
                 )
-        if self._reply is None:
-            stood_ns = self.stood_ns  # the robot has not moved yet: the first chunk is never late
+        if stood_ns is None:
+            stood_ns = self.stood_ns
         elif self._is_late(stood_ns):
             late_s = (self.stood_ns - stood_ns) / SECOND_NS
             why = f"the robot has paused for {late_s:.1f} s since the chunk's observation"

@@ -380,6 +380,42 @@ def test_the_first_call_of_an_episode_waits_for_its_chunk(pause_s: float, *, wai
     fly(lab, 3, 505.0)
 
 
+@pytest.mark.parametrize("hold_ns", [0, 300 * MS])
+def test_a_chunk_for_which_the_first_call_of_an_episode_waits_is_not_late(hold_ns: int) -> None:
+    """Although the program has waited for longer than the sum of deadline and hold."""
+    lab, _ = flying(options=replace(OPTIONS, hold_ns=hold_ns), thinking=0.1)
+    lab.thinking_ns = 600 * MS
+    lab.sleep(5)
+    assert first_row(lab.infer(state(500.0))) == 500.0
+
+
+def test_an_episode_after_an_error_begins_with_a_chunk() -> None:
+    """The program has stopped the robot because of the error, and begins again later."""
+    lab, position = flying(thinking=0.1)
+    lab.is_cut = True
+    assert fly(lab, 20, position)[0][-1] is None
+    lab.is_cut = False
+    lab.thinking_ns = 300 * MS
+    lab.sleep(10)
+    assert first_row(lab.infer(state(500.0))) == 500.0
+
+
+@pytest.mark.parametrize("thinking", [0.95, 4.95])
+def test_the_second_chunk_of_a_first_observation_that_was_sent_again_is_ignored(
+    thinking: float,
+) -> None:
+    """The observation was sent again while its chunk was under way."""
+    lab = Lab(thinking=thinking, to_policy="constant(50ms)", to_robot="constant(50ms)")
+    lab.connect()
+    lab.infer(state(0.0))
+    lab.sleep(0.1)
+    assert lab.robot.figures()["dropped"] == {"for another life": 1}
+    assert not any(isinstance(each, events.ChunkRefused) for each in lab.robot.events())
+    lab.thinking_ns = 0
+    fly(lab, 3, 5.0)
+    assert lab.robot.figures()["delay_s"] < 0.2
+
+
 # -- network -----------------------------------------------------------------------------------
 
 
