@@ -177,7 +177,10 @@ class _CallLine:
         return True
 
     async def run(self) -> None:
-        await asyncio.get_running_loop().create_future()
+        try:
+            await asyncio.get_running_loop().create_future()
+        finally:  # a call in another thread must not wait any longer
+            self.answers.put(FrameType.CLOSED.value)
 
 
 class Robot:
@@ -290,10 +293,13 @@ class Robot:
 
     def _answer(self) -> bytes:
         try:
-            return self._line.answers.get(timeout=self._patience_s)
+            answer = self._line.answers.get(timeout=self._patience_s)
         except queue.Empty:
             missing = "answer of the robot end" if self._is_connected else "metadata of the policy"
             raise PolicyError(f"no {missing} within {self._patience_s:g} s") from None
+        if answer == FrameType.CLOSED:
+            raise PolicyError("the robot end was closed")
+        return answer
 
     def infer(self, observation: Any) -> Any:
         """Reply to an observation, from the present row on.
@@ -320,10 +326,11 @@ class Robot:
 
     def reset(self) -> None:
         """Begin an episode: no row of an earlier chunk is executed, and the next call waits for
-        the policy's chunk, as the first call does.
+        the policy's chunk, as the first call does. A call in another thread is answered before.
         """
-        self._do(self._begin)
-        self._is_connected, self._unread = False, 0
+        with self._lock:
+            self._do(self._begin)
+            self._is_connected, self._unread = False, 0
 
     def _begin(self) -> None:
         assert self._line

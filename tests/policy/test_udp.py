@@ -228,6 +228,37 @@ def test_calls_from_several_threads_are_made_one_after_the_other() -> None:
     robot._shell._close_sockets()
 
 
+def test_an_episode_begins_after_the_answer_to_a_call_of_another_thread() -> None:
+    robot = Robot("127.0.0.1:9", actions="delta")
+    assert robot._line
+    answers, done = robot._line.answers, list[str]()
+
+    def say(said: bytes) -> None:
+        resetting.append(pool.submit(robot.reset))
+        with pytest.raises(TimeoutError):
+            resetting[0].result(0.1)
+        done.append("infer")
+        answers.put(said)
+
+    robot._say = say  # type: ignore[method-assign]
+    robot._do = lambda _: done.append("reset")  # type: ignore[method-assign]
+    robot._is_connected, robot._unread, robot._patience_s = True, 0, 0.5
+    resetting = list[Any]()
+    with ThreadPoolExecutor(1) as pool:
+        assert robot.infer(7) == 7
+    assert done == ["infer", "reset"]
+    assert robot._unread == 0
+    robot._shell._close_sockets()
+
+
+def test_a_call_of_another_thread_ends_when_the_robot_is_closed() -> None:
+    with ThreadPoolExecutor(1) as pool:
+        with Robot("127.0.0.1:9", actions="delta") as robot:
+            call = pool.submit(robot.infer, {})
+        with pytest.raises(PolicyError, match="closed"):
+            call.result(10)
+
+
 def test_a_robot_that_is_connected_again_gets_no_earlier_answer() -> None:
     robot = Robot("127.0.0.1:9", actions="delta")
     assert robot._line
