@@ -5,7 +5,7 @@ SIDE_MIN to SIDE_MAX. An image's key is its path in the observation, as in `imag
 """
 
 import io
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import numpy as np
@@ -20,6 +20,8 @@ with extras.named("policy"):
 SIDE_MIN, SIDE_MAX = 32, 4096
 JPEG, FIRST = b"__jpeg__", b"channels_first"
 QUALITY = 90
+VALUES_MAX = 256
+"""Largest number of elements of a list or an array whose elements are shown."""
 
 
 def is_image(value: Any) -> bool:
@@ -101,6 +103,18 @@ class Unpacker:
         except (OSError, TypeError, SyntaxError, Image.DecompressionBombError) as error:
             raise ValueRefused(f"invalid JPEG image: {error}") from None
         return np.ascontiguousarray(array.transpose(2, 0, 1)) if table.get(FIRST) else array
+
+
+def leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Keys and values of a nested value; a compressed image and a large list are one value each."""
+    if isinstance(value, dict) and not isinstance(value.get(JPEG), bytes):
+        for name, each in value.items():
+            yield from leaves(each, f"{key}/{name}" if key else str(name))
+    elif isinstance(value, list) and len(value) <= VALUES_MAX and not _is_pixels(value):
+        for i, each in enumerate(value):
+            yield from leaves(each, f"{key}/{i}")
+    else:
+        yield key, value
 
 
 def _mapped(value: Any, key: str, change: Callable[[str, Any], Any]) -> Any:

@@ -10,13 +10,13 @@ The event loop only appends to bounded histories and keeps the newest observatio
 import time
 from base64 import b64encode
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from skytether.policy.images import JPEG
+from skytether.policy.images import JPEG, leaves
 from skytether.policy.robot import AnsweredCall
 from skytether.shared.base.units import MILLISECOND_NS
 from skytether.shared.endpoints.endpoint import Address
@@ -92,22 +92,14 @@ class CallPage:
             "seconds": tuple(self._seconds),
             "events": tuple(self._events),
             "figures": self._figures,
-            "images": {key: b64encode(jpeg).decode() for key, jpeg in _images(self._sent, "")},
+            "images": {
+                key: b64encode(image[JPEG]).decode()
+                for key, image in leaves(self._sent)
+                if isinstance(image, dict) and len(image[JPEG]) <= IMAGE_BYTES_MAX
+            },
         }
         return OK, JSON, msgspec.json.encode(state)
 
 
 def _ms(time_ns: int) -> float:
     return round(time_ns / MILLISECOND_NS, 1)
-
-
-def _images(value: Any, key: str) -> Iterator[tuple[str, bytes]]:
-    """Keys and JPEG data of the images of an observation, by `Compressor`."""
-    if isinstance(value, list):
-        value = dict(enumerate(value))
-    if isinstance(value, dict):
-        jpeg = value.get(JPEG)
-        if isinstance(jpeg, bytes) and len(jpeg) <= IMAGE_BYTES_MAX:
-            yield key, jpeg
-        for name, each in value.items():
-            yield from _images(each, f"{key}/{name}" if key else str(name))

@@ -15,7 +15,7 @@ import queue
 import threading
 import time
 from base64 import b64encode
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict
 from functools import partial
@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from skytether.policy.images import JPEG, is_image
+from skytether.policy.images import JPEG, VALUES_MAX, is_image, leaves
 from skytether.policy.players import PLAYERS
 from skytether.policy.robot import AnsweredCall, LinkStep, RobotOptions
 from skytether.shared.base import files
@@ -33,9 +33,6 @@ from skytether.shared.base.units import SECOND_NS
 from skytether.shared.events.flight import Event
 from skytether.shared.formats import foxglove
 
-VALUES_MAX = 256
-"""Largest number of elements of an array in `/observation`; of larger arrays only type and shape
-are recorded."""
 ACTIONS_MAX = 16_384
 """Largest number of elements of the actions in `/answers`."""
 WAITING_MAX = 192
@@ -138,7 +135,7 @@ class CallRecording:
     def _add_call(self, call: AnsweredCall) -> None:
         self._channels.now_ns = call.time_ns - call.waited_ns + self._offset_ns
         numbers = dict[str, Any]()
-        for name, value in _leaves(call.sent, ""):
+        for name, value in leaves(call.sent):
             if isinstance(value, dict):
                 data = b64encode(value[JPEG]).decode()
                 image = {"frame_id": name, "data": data, "format": "jpeg"}
@@ -177,18 +174,6 @@ class CallRecording:
     def _add(self, topic: str, kind: str, message: Any) -> None:
         name = f"skytether.{kind}"
         self._channels.put(topic, name, SCHEMAS[name], message)
-
-
-def _leaves(value: Any, key: str) -> Iterator[tuple[str, Any]]:
-    """Keys and values of an observation, as `images` names them; a JPEG image is one value."""
-    if isinstance(value, dict) and JPEG not in value:
-        for name, each in value.items():
-            yield from _leaves(each, f"{key}/{name}" if key else str(name))
-    elif isinstance(value, list) and len(value) <= VALUES_MAX:
-        for i, each in enumerate(value):
-            yield from _leaves(each, f"{key}/{i}")
-    elif value is not None:
-        yield key, value
 
 
 def _raw_image(name: str, value: NDArray[Any]) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from chromium import CHROMIUM, chromium, opened, until
 from policy_lab import Lab, PolicyServer, calls, command, joined, served, state
 from skytether.policy import events
-from skytether.policy.images import Compressor
+from skytether.policy.images import Compressor, leaves
 from skytether.policy.page import CALLS_MAX, EVENTS_MAX, IMAGE_BYTES_MAX, PAGE, CallPage
 from skytether.policy.robot import AnsweredCall
 from skytether.policy.schedule import Kind
@@ -97,6 +97,13 @@ def test_the_newest_images_are_shown_as_they_were_sent(page: CallPage) -> None:
     assert images == {"images/top": jpeg, "list/0": jpeg}
     page.note(answered(3, {"large": {b"__jpeg__": bytes(IMAGE_BYTES_MAX + 1)}}))
     assert shown(page)["images"] == {}
+
+
+def test_of_images_as_lists_no_number_is_looked_at() -> None:
+    """It would take as long as many answers."""
+    lists = GREY.tolist()
+    sent = Compressor()({"lists": lists, "state": [1.0, 2.0], "long": [0] * 10_000})
+    assert [key for key, _ in leaves(sent)] == ["lists", "state/0", "state/1", "long"]
 
 
 def test_the_histories_are_bounded(page: CallPage) -> None:
