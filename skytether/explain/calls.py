@@ -20,7 +20,7 @@ import numpy as np
 
 from skytether.client.link import PlainLink
 from skytether.policy import values
-from skytether.policy.messages import CHUNK, PartMessage, Welcome, encode
+from skytether.policy.messages import CHUNK, Welcome, encode
 from skytether.policy.parts import split
 from skytether.policy.players import PLAYERS
 from skytether.policy.robot import (
@@ -257,10 +257,7 @@ def _chunk(call: int, message: int, reply: Reply | None) -> list[Datagram]:
     assert reply
     content = values.pack({"actions": np.zeros((reply.rows, 1), np.uint8)})
     data = values.pack([call, content, "" if reply.rows else "error"])
-    return [
-        Datagram(encode(PartMessage(1, *part[:-1], 0, part.data)), SERVER, 0)
-        for part in split(data, CHUNK, message, 0)
-    ]
+    return [Datagram(encode(part), SERVER, 0) for part in split(data, 1, CHUNK, message, 0)]
 
 
 def recorded(program: Program, calls: Sequence[Call]) -> Replay:

@@ -9,11 +9,10 @@ from collections import OrderedDict, deque
 from dataclasses import dataclass, field
 from typing import Any
 
-from skytether.policy import parts
 from skytether.policy.form import PART_HEAD_BYTES, Form, block_parts, form_of
-from skytether.policy.messages import STAMPS, PartMessage, Report, encode
+from skytether.policy.messages import STAMPS, Part, Report, encode
 from skytether.policy.pace import RATE_MAX, Pace, Tally, filtered, fit
-from skytether.policy.parts import Part, Reassembly
+from skytether.policy.parts import Reassembly, split
 from skytether.shared.base.units import HEADER_BYTES, MICROSECOND_NS, MILLISECOND_NS
 from skytether.shared.wire.drop import Drop, ProtocolError
 
@@ -93,7 +92,7 @@ class Exchange:
         message, is_urgent = self._next.pop(stream)
         number = self._numbers[stream] = self._numbers.get(stream, -1) + 1
         form = self.forms[stream] = form_of(len(message), self.pace.loss, is_urgent=is_urgent)
-        self._queue[stream] = deque(parts.split(message, stream, number, form.parity))
+        self._queue[stream] = deque(split(message, self.session, stream, number, form.parity))
         self._sent[stream, number] = False
         while len(self._sent) > REMEMBERED_MAX:
             self._sent.popitem(last=False)
@@ -133,7 +132,7 @@ class Exchange:
             stream = max(waiting)  # metadata has the highest number, and is sent first
             part = self._queue[stream].popleft()
             sent_us = now_ns // MICROSECOND_NS % STAMPS
-            out.append(encode(PartMessage(self.session, *part[:-1], sent_us, part.data)))
+            out.append(encode(part._replace(sent_us=sent_us)))
             size = len(part.data) + PART_HEAD_BYTES + HEADER_BYTES
             self.pace.sent(size, now_ns)
             self.sent += 1
@@ -145,13 +144,13 @@ class Exchange:
                 self._sent[stream, queued[0].number] = True
         return out
 
-    def accept(self, message: PartMessage, *, now_ns: int) -> bytes | None:
+    def accept(self, part: Part, *, now_ns: int) -> bytes | None:
         """Accept a part; returns the message if this part completes it.
 
         Raises:
             ProtocolError: see `parts.Reassembly.accept`.
         """
-        stream, part = message.stream, message.part
+        stream = part.stream
         whole = self._whole.setdefault(stream, Reassembly())
         coming = self._coming.get(stream)
         if coming and part.number > coming.number:
@@ -172,7 +171,7 @@ class Exchange:
         if coming is None and spare is None:
             coming = self._coming[stream] = _Coming(part.number, expected)
         if coming and part.number == coming.number:
-            self._count(coming, message, now_ns)
+            self._count(coming, part, now_ns)
             if len(coming.places) == coming.expected:
                 self._report(stream, now_ns)
         elif spare:
@@ -182,17 +181,17 @@ class Exchange:
         self.repaired += arrived.repaired
         return arrived.message
 
-    def _count(self, coming: _Coming, message: PartMessage, now_ns: int) -> None:
-        place = message.block, message.place
+    def _count(self, coming: _Coming, part: Part, now_ns: int) -> None:
+        place = part.block, part.place
         if place in coming.places:
             return  # a duplicate over another path
         coming.places.add(place)
         self.came += 1
-        coming.bytes += len(message.data) + PART_HEAD_BYTES + HEADER_BYTES
+        coming.bytes += len(part.data) + PART_HEAD_BYTES + HEADER_BYTES
         if not coming.times_us:
-            coming.sent_us = message.sent_us
+            coming.sent_us = part.sent_us
         coming.last_ns = now_ns
-        after_us = _signed(message.sent_us - coming.sent_us)
+        after_us = _signed(part.sent_us - coming.sent_us)
         coming.times_us.append((after_us, now_ns // MICROSECOND_NS))
 
     def _report(self, stream: int, now_ns: int) -> None:

@@ -24,7 +24,6 @@ from msgspec import Meta
 from skytether.policy import values
 from skytether.policy.committed import RobotRows
 from skytether.policy.form import PARITY_MAX, PART_BYTES_MAX
-from skytether.policy.parts import Part
 from skytether.shared.wire.drop import Drop, ProtocolError
 from skytether.shared.wire.protocol import PAYLOAD_BYTES_MAX, VERSION, Refusal, kind_of
 
@@ -58,25 +57,25 @@ class Welcome(NamedTuple):
     refusal: Annotated[int, Meta(ge=0, lt=len(Refusal))] = Refusal.ACCEPTED
 
 
-class PartMessage(NamedTuple):
-    """Part of a message, see `parts.Part`."""
+class Part(NamedTuple):
+    """Part of a message."""
 
     session: U32
     stream: Stream
+    """Its newer messages replace its older ones."""
     number: U63
+    """Sequence number of the message in its stream."""
     size: U32
+    """Size of the message [B]."""
     blocks: U8
     parity: Annotated[int, Meta(ge=0, le=PARITY_MAX)]
+    """Number of parity parts of each block."""
     block: U8
     place: U8
+    """Index of the part in its block; data parts come before parity parts."""
     sent_us: U32
     """Send time by the sender's clock [µs]."""
     data: Annotated[bytes, Meta(min_length=1, max_length=PART_BYTES_MAX)]
-
-    @property
-    def part(self) -> Part:
-        _, stream, number, size, blocks, parity, block, place, _, data = self
-        return Part(stream, number, size, blocks, parity, block, place, data)
 
 
 class Report(NamedTuple):
@@ -106,8 +105,8 @@ class Report(NamedTuple):
     """Number of parts received of them."""
 
 
-Message = Hello | Welcome | PartMessage | Report
-KINDS: dict[int, type[Any]] = {1: Hello, 2: Welcome, 20: PartMessage, 21: Report}
+Message = Hello | Welcome | Part | Report
+KINDS: dict[int, type[Any]] = {1: Hello, 2: Welcome, 20: Part, 21: Report}
 _NUMBERS = {kind: number for number, kind in KINDS.items()}
 _DECODERS = {number: msgspec.msgpack.Decoder(kind) for number, kind in KINDS.items()}
 _ENCODER = msgspec.msgpack.Encoder()

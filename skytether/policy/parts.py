@@ -12,6 +12,7 @@ from typing import NamedTuple
 import zfec
 
 from skytether.policy.form import PARITY_MAX, block_parts, blocks_of
+from skytether.policy.messages import Part
 from skytether.policy.values import BYTES_MAX
 from skytether.shared.wire.drop import Drop, ProtocolError
 
@@ -22,26 +23,10 @@ _Shape = tuple[int, int, int]
 """Size of a message [B], number of blocks, and number of parity parts of each block."""
 
 
-class Part(NamedTuple):
-    """One datagram of a message."""
-
-    stream: int
-    """Number of the stream; its newer messages replace its older ones."""
-    number: int
-    """Sequence number of the message in its stream."""
-    size: int
-    """Size of the message [B]."""
-    blocks: int
-    parity: int
-    """Number of parity parts of each block."""
-    block: int
-    place: int
-    """Index of the part in its block; data parts come before parity parts."""
-    data: bytes
-
-
-def split(message: bytes, stream: int, number: int, parity: int) -> list[Part]:
-    """Parts of a message, with `parity` parity parts of each block, in the order of sending."""
+def split(message: bytes, session: int, stream: int, number: int, parity: int) -> list[Part]:
+    """Parts of a message, with `parity` parity parts of each block, in the order of sending; their
+    `sent_us` is 0.
+    """
     size, blocks = len(message), blocks_of(len(message))
     count, length = block_parts(size, blocks)
     padded = message.ljust(blocks * count * length, b"\0")
@@ -52,7 +37,7 @@ def split(message: bytes, stream: int, number: int, parity: int) -> list[Part]:
         more = zfec.Encoder(count, count + parity).encode(data)[count:] if parity else []
         coded.append([*data, *more])
     return [
-        Part(stream, number, size, blocks, parity, block, index, coded[block][index])
+        Part(session, stream, number, size, blocks, parity, block, index, 0, coded[block][index])
         for index in range(count + parity)
         for block in range(blocks)
     ]

@@ -24,7 +24,7 @@ from skytether.policy.messages import (
     OBSERVATION,
     Hello,
     ObservationContent,
-    PartMessage,
+    Part,
     Welcome,
     content,
     decode,
@@ -179,7 +179,7 @@ class PolicyEnd(Endpoint):
         if call.vehicle is None and (datagram.socket, datagram.peer) not in robot.paths:
             raise ProtocolError(Drop.ELSEWHERE)
         robot.hear(call.line, datagram, now_ns)
-        if isinstance(message, PartMessage):
+        if isinstance(message, Part):
             if message.stream != OBSERVATION:
                 raise ProtocolError(Drop.FIELD)
             if arrived := robot.exchange.accept(message, now_ns=now_ns):

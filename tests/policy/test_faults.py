@@ -23,7 +23,7 @@ from skytether.client.secure import SecureLink
 from skytether.policy import events, metrics, values
 from skytether.policy.exchange import Exchange
 from skytether.policy.images import Compressor
-from skytether.policy.messages import METADATA, OBSERVATION, PartMessage, decode
+from skytether.policy.messages import METADATA, OBSERVATION, Part, decode
 from skytether.policy.robot import FrameType, RobotEnd, RobotOptions
 from skytether.policy.serving import PolicyEnd
 from skytether.policy.session import REFUSALS
@@ -464,7 +464,7 @@ def test_stamps_that_wrap_and_messages_beyond_2_32(sent_us: int) -> None:
         whole = None
         for payload in ends[0].outbox(now_ns=now_ns):
             message = decode(payload)
-            assert isinstance(message, PartMessage)
+            assert isinstance(message, Part)
             whole = ends[1].accept(message, now_ns=now_ns + 20 * MS) or whole
         assert whole == bytes(3000)
         for payload in ends[1].outbox(now_ns=now_ns + 20 * MS):
@@ -524,7 +524,7 @@ def test_under_a_low_rate_metadata_arrives_and_calls_go_on() -> None:
     for now_ns in range(0, 6 * SECOND_NS, 10 * MS):
         end.send(OBSERVATION, bytes(2000))
         sent = [decode(each) for each in end.outbox(now_ns=now_ns)]
-        streams += [each.stream for each in sent if isinstance(each, PartMessage)]
+        streams += [each.stream for each in sent if isinstance(each, Part)]
     assert streams.count(METADATA) >= 45
     assert streams[-1] == OBSERVATION
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from policy_lab import MS, Lab, state
 from skytether.policy import parts, values
 from skytether.policy.exchange import REMEMBERED_MAX
-from skytether.policy.messages import CHUNK, METADATA, OBSERVATION, PartMessage, Report, encode
+from skytether.policy.messages import CHUNK, METADATA, OBSERVATION, Report, encode
 from skytether.policy.robot import FrameType, RobotOptions
 from skytether.policy.virtual import ROBOT, SERVER
 from skytether.shared.base.units import SECOND_NS
@@ -61,8 +61,8 @@ def test_no_authentic_message_breaks_an_end(
             sent = [Report(exchange.session, *forged)]
         else:
             (stream, content), number, sent_us = forged
-            split = parts.split(values.pack(content), stream, number, 1)
-            sent = [PartMessage(exchange.session, *p[:-1], sent_us, p.data) for p in split]
+            split = parts.split(values.pack(content), exchange.session, stream, number, 1)
+            sent = [part._replace(sent_us=sent_us) for part in split]
         end, peer = (lab.robot, SERVER) if to_robot else (lab.server, ROBOT)
         for each in map(encode, sent):
             end.receive(Datagram(each, peer, 0), now_ns=lab.now_ns)

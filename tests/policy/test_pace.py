@@ -11,7 +11,7 @@ from skytether.netem.impairments.direction import impairments
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
 from skytether.policy import exchange, pace
 from skytether.policy.exchange import Exchange
-from skytether.policy.messages import OBSERVATION, PartMessage, Report, decode
+from skytether.policy.messages import OBSERVATION, Part, Report, decode
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import Datagram
 from skytether.shared.wire.drop import ProtocolError
@@ -89,9 +89,9 @@ class Course:
         message = decode(payload)
         if isinstance(message, Report):
             end.learn(message, now_ns=now_ns + shift_ns)
-        if isinstance(message, PartMessage) and now_ns >= self.from_s * SECOND_NS:
+        if isinstance(message, Part) and now_ns >= self.from_s * SECOND_NS:
             self.received += len(payload) + 28
-        if isinstance(message, PartMessage):
+        if isinstance(message, Part):
             with suppress(ProtocolError):
                 self.complete += bool(end.accept(message, now_ns=now_ns + shift_ns)) and (
                     now_ns >= self.from_s * SECOND_NS

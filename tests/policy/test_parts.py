@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from policy_lab import Lab, state
 from skytether.policy import form, parts
 from skytether.policy.exchange import Exchange
-from skytether.policy.messages import OBSERVATION, PartMessage, Report, decode, encode
+from skytether.policy.messages import OBSERVATION, Part, Report, decode, encode
 from skytether.policy.pace import Tally
-from skytether.policy.parts import HELD_MAX, Part, Reassembly
+from skytether.policy.parts import HELD_MAX, Reassembly
 from skytether.policy.robot import RobotOptions
 from skytether.policy.virtual import NoActionError
 from skytether.shared.base.units import MILLISECOND_NS, SECOND_NS
@@ -24,7 +24,7 @@ SIZES = st.integers(1, 6000) | st.sampled_from([1120, 1121, 215_040, 215_041, 50
 
 
 def cut(message: bytes, number: int = 0, parity: int = 3) -> list[Part]:
-    return parts.split(message, OBSERVATION, number, parity)
+    return parts.split(message, 1, OBSERVATION, number, parity)
 
 
 def put(whole: Reassembly, each: Part) -> bytes | None:
@@ -77,6 +77,7 @@ def test_of_many_messages_that_are_not_whole_the_newest_are_held() -> None:
 @given(
     st.builds(
         Part,
+        st.just(1),
         st.integers(0, 2),
         st.integers(0, 3),
         st.integers(0, 10_000_000),
@@ -84,6 +85,7 @@ def test_of_many_messages_that_are_not_whole_the_newest_are_held() -> None:
         st.integers(0, 64),
         st.integers(0, 255),
         st.integers(0, 255),
+        st.just(0),
         st.binary(min_size=1, max_size=1120),
     )
 )
@@ -145,7 +147,7 @@ def pump(
         for each in [each for each in under_way if each[0] <= now_ns]:
             under_way.remove(each)
             message, end = decode(each[2]), ends[each[1]]
-            if isinstance(message, PartMessage):
+            if isinstance(message, Part):
                 end.accept(message, now_ns=now_ns)
             elif isinstance(message, Report):
                 end.learn(message, now_ns=now_ns)
@@ -156,7 +158,7 @@ def test_the_sender_learns_round_trip_and_loss() -> None:
     ends, random = (Exchange(1), Exchange(1)), Random(5)
 
     def passes(payload: bytes) -> bool:
-        return not isinstance(decode(payload), PartMessage) or random.random() > 0.2
+        return not isinstance(decode(payload), Part) or random.random() > 0.2
 
     for _ in range(60):
         ends[0].send(OBSERVATION, bytes(20_000))
@@ -173,7 +175,7 @@ def test_the_loss_of_messages_of_one_part_is_measured() -> None:
     loss, whole = 0.0, 0
 
     def passes(payload: bytes) -> bool:
-        return not isinstance(decode(payload), PartMessage) or random.random() >= loss
+        return not isinstance(decode(payload), Part) or random.random() >= loss
 
     for number in range(300):
         loss = 0.0 if number < 100 else 0.3
@@ -229,7 +231,7 @@ def test_a_message_that_has_begun_is_sent_to_its_end_and_of_those_that_wait_the_
     later = first + [
         each for at in range(0, 3 * SECOND_NS, 10 * MS) for each in end.outbox(now_ns=at)
     ]
-    sent = [message for message in map(decode, later) if isinstance(message, PartMessage)]
+    sent = [message for message in map(decode, later) if isinstance(message, Part)]
     assert list(dict.fromkeys(message.size for message in sent)) == [30_000, 10]
 
 
@@ -241,7 +243,7 @@ def test_under_a_low_rate_observations_go_on_and_no_loss_is_measured() -> None:
             ends[0].send(OBSERVATION, bytes(8000))
         for end, other in (ends, ends[::-1]):
             for message in map(decode, end.outbox(now_ns=now_ns)):
-                if isinstance(message, PartMessage):
+                if isinstance(message, Part):
                     whole += other.accept(message, now_ns=now_ns + 50 * MS) is not None
                 elif isinstance(message, Report):
                     other.learn(message, now_ns=now_ns + 100 * MS)
