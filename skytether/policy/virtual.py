@@ -10,6 +10,7 @@ The ends are `RobotEnd` and `PolicyEnd`, as deployed; the network is emulated by
 the same seed are equal bit for bit.
 """
 
+from collections import deque
 from collections.abc import Callable
 from heapq import heappop, heappush
 from itertools import count
@@ -32,6 +33,7 @@ from skytether.shared.scenario.grammar import GrammarError
 SERVER: Address = ("192.0.2.1", 47010)
 ROBOT: Address = ("192.0.2.2", 5000)
 PROGRAM: Address = ("program", 1)
+ANSWERS_MAX = 4096
 CONNECTS_NS = 60 * SECOND_NS
 """Longest time for the policy's metadata to arrive [ns]."""
 
@@ -87,8 +89,9 @@ class Emulated:
             gives_rows=gives_rows,
         )
         self.now_ns = 0
-        self.answers: list[tuple[int, bytes]] = []
-        """Time [ns] and content of each frame sent to the program, see `robot.FrameType`."""
+        self.answers: deque[tuple[int, bytes]] = deque(maxlen=ANSWERS_MAX)
+        """Time [ns] and content of the newest frames sent to the program, see `robot.FrameType`."""
+        self._is_answered = False
         self.is_cut = False
         """Whether the network is cut."""
         self._ways = _way(to_policy, seed, "to_policy"), _way(to_robot, seed, "to_robot")
@@ -104,9 +107,7 @@ class Emulated:
         Raises:
             NoActionError: no metadata has arrived within CONNECTS_NS.
         """
-        self.say(FrameType.OPENED.value)
-        self.run(self.now_ns + CONNECTS_NS, lambda: bool(self.answers))
-        if not self.answers:
+        if not self._is_answered_within(CONNECTS_NS, FrameType.OPENED.value):
             raise NoActionError("no metadata from the policy")
         return values.unpack(self.answers[-1][1][1:])
 
@@ -116,14 +117,20 @@ class Emulated:
         Raises:
             NoActionError: the reply is an error.
         """
-        before = len(self.answers)
-        self.say(FrameType.MESSAGE.value + values.pack(observation))
         # Each call is answered by its deadline; the first call is answered within `begin_ns`.
-        self.run(self.now_ns + 3600 * SECOND_NS, lambda: len(self.answers) > before)
+        said = FrameType.MESSAGE.value + values.pack(observation)
+        self._is_answered_within(3600 * SECOND_NS, said)
         said = self.answers[-1][1]
         if said[:1] == FrameType.ERROR:
             raise NoActionError(said[1:].decode())
         return values.unpack(said[1:])
+
+    def _is_answered_within(self, longest_ns: int, said: bytes) -> bool:
+        """Whether a frame of the program is answered in this time [ns], until which time passes."""
+        self._is_answered = False
+        self.say(said)
+        self.run(self.now_ns + longest_ns, lambda: self._is_answered)
+        return self._is_answered
 
     def sleep(self, seconds: float) -> None:
         """Advance the virtual time by `seconds` [s]."""
@@ -173,6 +180,7 @@ class Emulated:
             payload, peer, socket = datagram
             if socket == LINE and end is self.robot:
                 self.answers.append((self.now_ns, payload))
+                self._is_answered = True
             elif socket == LINE:
                 self._ask(payload, peer)
             else:

@@ -169,7 +169,7 @@ def test_whatever_happens_each_call_gets_one_answer_by_its_deadline(
             longest_ns = max(longest_ns, options.pause_ns)  # a new episode may begin
         limit_ns = max(began_ns, world.until_ns) + longest_ns + 1
         lab.run(limit_ns if calls else began_ns)
-        answers = [each for each in lab.answers[before:] if not is_metadata(each[1])]
+        answers = [each for each in [*lab.answers][before:] if not is_metadata(each[1])]
         assert len(answers) == calls
         lab.sleep(wait_ms / 1e3)
 
