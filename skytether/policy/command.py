@@ -205,14 +205,11 @@ def join(argv: Sequence[str]) -> None:
         raise CommandError(f"got {got}, expected either HOST:PORT or --path", CONFIGURATION)
     paths = command.paths("--path", options.path) if options.path else []
     paths = paths or [NetworkPath("", command.address("HOST:PORT", options.server))]
-    for flag, value, least, most in (
-        ("--id", options.robot, 0, 65_535),
-        ("--rows", options.rows, 1, 1024),
-        ("--quality", options.quality, 1, 100),
-        ("--resize", options.resize or 32, 32, 4096),
-    ):
-        if not least <= value <= most:
-            raise _wrong(flag, value, f"{least} to {most}")
+    for name in ("robot", "rows", "quality", "resize"):
+        value, (least, most) = getattr(options, name), inside.BOUNDS[name]
+        if value is not None and not least <= value <= most:
+            flag = "--id" if name == "robot" else f"--{name}"
+            raise _wrong(flag, value, f"{least:g} to {most:g}")
     listen_at = command.address("--listen", options.listen)
     page_at = command.address("--page", options.page) if options.page else None
     for flag, local in (("--listen", listen_at), ("--page", page_at)):

@@ -12,9 +12,9 @@ from typing import Any, Self
 
 from skytether.client.link import ClientLink, PlainLink
 from skytether.policy import values
-from skytether.policy.images import QUALITY, Compressor
+from skytether.policy.images import QUALITY, SIDE_MAX, SIDE_MIN, Compressor
 from skytether.policy.robot import LINE, FrameType, RobotEnd, RobotOptions
-from skytether.policy.schedule import Actions
+from skytether.policy.schedule import ROWS_MAX, Actions
 from skytether.policy.serving import PolicyEnd, reply_of
 from skytether.server.gate import Gate, PlainGate
 from skytether.shared.base.errors import ConfigError
@@ -28,6 +28,16 @@ from skytether.shell.driving.driver import Shell, new_event_loop, run
 from skytether.shell.host.udp import is_loopback
 
 PEER: Address = ("program", 1)
+BOUNDS: dict[str, tuple[float, float]] = {
+    "robot": (0, 65_535),
+    "rows": (1, ROWS_MAX),
+    "quality": (1, 100),
+    "resize": (SIDE_MIN, SIDE_MAX),
+    "deadline": (1e-3, 3600.0),
+    "step": (1e-3, 3600.0),
+    "hold": (0.0, 3600.0),
+}
+"""Smallest and largest value of arguments of `Robot`."""
 Hear = Callable[[Datagram], None]
 
 
@@ -234,16 +244,9 @@ class Robot:
     ) -> None:
         if actions not in ("absolute", "delta"):
             raise ConfigError(f"actions: got {actions!r}, expected 'absolute' or 'delta'")
-        for name, value, least, most in (
-            ("deadline", deadline, 1e-3, 3600.0),
-            ("step", 1.0 if step is None else step, 1e-3, 3600.0),
-            ("hold", hold, 0.0, 3600.0),
-            ("rows", rows, 1, 1024),
-            ("robot", robot, 0, 65_535),
-            ("quality", quality, 1, 100),
-            ("resize", 32 if resize is None else resize, 32, 4096),
-        ):
-            if not least <= value <= most:
+        given = (robot, rows, quality, resize, deadline, step, hold)
+        for (name, (least, most)), value in zip(BOUNDS.items(), given, strict=True):
+            if value is not None and not least <= value <= most:
                 raise ConfigError(f"{name}: got {value}, expected {least:g} to {most:g}")
         at, link = _address("server", server), link_of(keys, robot)
         _check_sealed("server", at, secure=link.secure or insecure)
