@@ -232,7 +232,7 @@ def join(argv: Sequence[str]) -> None:
         if options.record:
             recording = stack.enter_context(_recorded(options.record, of_end))
         if page_at:
-            page = stack.enter_context(_shown(page_at, options))
+            page = stack.enter_context(_shown(page_at, options, of_end))
         watching = [each for each in (recording, page) if each]
 
         def note(call: AnsweredCall) -> None:
@@ -265,18 +265,17 @@ def join(argv: Sequence[str]) -> None:
 
 
 @contextmanager
-def _shown(address: Address, options: JoinOptions) -> Iterator["CallPage"]:
+def _shown(address: Address, options: JoinOptions, of_end: RobotOptions) -> Iterator["CallPage"]:
     """Serve the live page in the block."""
     from skytether.policy.page import CallPage
     from skytether.shell.processes.exporter import MetricsError
 
-    chosen = _robot_options(options)
     about = {
         "robot": options.robot,
         "server": options.server or ", ".join(options.path),
         "actions": options.actions,
-        "deadline_ms": chosen.deadline_ns / MILLISECOND_NS,
-        "hold_ms": chosen.hold_ns / MILLISECOND_NS,
+        "deadline_ms": of_end.deadline_ns / MILLISECOND_NS,
+        "hold_ms": of_end.hold_ns / MILLISECOND_NS,
     }
     try:
         page = CallPage(address, about)

@@ -278,6 +278,7 @@ class Robot:
         return self
 
     def __exit__(self, *_: object) -> None:
+        self._say(FrameType.CLOSED.value)  # a call that was interrupted is not answered later
         self._loop.call_soon_threadsafe(self._task.cancel)
         self._thread.join()
 

@@ -268,6 +268,8 @@ def test_a_robot_that_is_connected_again_gets_no_earlier_answer() -> None:
             assert not robot._is_connected
             robot._line.answers.put(b"m")
             robot._is_connected = True
+            robot._say(FrameType.MESSAGE.value + values.pack({}))
+        assert robot._end._program is None
 
 
 @pytest.mark.parametrize(
