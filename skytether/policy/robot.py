@@ -10,8 +10,8 @@ protocol, or `Robot.infer`. A call is an observation. It is answered
   program must stop the robot.
 
 The first call of a program waits for its chunk for up to `begin_ns`, since the robot has not moved.
-The first call after the program has executed all rows and then made no call for more than
-`RobotOptions.pause_ns`, as between two episodes, waits for up to `pause_ns`.
+The first call after a pause, for which no row has remained and the program has made no call, waits
+for up to `RobotOptions.pause_ns` if the pause was longer, as between two episodes.
 
 A frame of the local connection begins with a byte of `FrameType`.
 """
@@ -340,7 +340,7 @@ class RobotEnd(Endpoint):
         call = _Call(self._calls, now_ns, answer_by_ns, is_first, step, number, stood_ns)
         program.call = call
         left, delay = schedule.left(now_ns=now_ns), self._delay_steps()
-        if not self._is_needed(program, step, left, delay):
+        if not (is_first or self._is_needed(program, step, left, delay)):
             self._answer(program, call, Kind.REST, now_ns)
             return
         try:

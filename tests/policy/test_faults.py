@@ -389,6 +389,14 @@ def test_a_chunk_for_which_the_first_call_of_an_episode_waits_is_not_late(hold_n
     assert first_row(lab.infer(state(500.0))) == 500.0
 
 
+def test_the_first_observation_of_an_episode_is_needed_although_rows_remain() -> None:
+    options = RobotOptions("absolute", 900 * MS, rows=5, spare_rows=0)
+    lab, position = flying(options=options)
+    lab.infer(state(position))
+    lab.sleep(1.3)
+    assert first_row(lab.infer(state(500.0))) == 500.0
+
+
 def test_an_episode_after_an_error_begins_with_a_chunk() -> None:
     """The program has stopped the robot because of the error, and begins again later."""
     lab, position = flying(thinking=0.1)
