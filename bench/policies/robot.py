@@ -275,7 +275,8 @@ class Threads:
             while True:
                 self._due.wait()
                 self._due.clear()
-                self._socket.send(packer.pack(self._newest.pop()))
+                if self._newest:  # not sent since it replaced the one before
+                    self._socket.send(packer.pack(self._newest.pop()))
 
     def _receive(self) -> None:
         with suppress(ConnectionClosed):
