@@ -219,7 +219,7 @@ class RobotEnd(Endpoint):
         *,
         boot_id: int,
         compress: Callable[[Any], Any] = lambda observation: observation,
-        on_answer: Callable[[AnsweredCall], None] | None = None,
+        on_answer: Callable[[AnsweredCall], None] = lambda _: None,
         on_step: Callable[[int, LinkStep], None] = lambda *_: None,
     ) -> None:
         super().__init__()
@@ -331,7 +331,10 @@ class RobotEnd(Endpoint):
         if not options.plays_on:
             schedule.stand(now_ns=now_ns)
         step = schedule.advance(now_ns=now_ns)
-        has_paused = schedule.has_paused(options.pause_ns, now_ns=now_ns)
+        pause_ns = options.pause_ns
+        if self._answered and self._answered.kind is Kind.HOLD:  # whose rows have been executed
+            pause_ns += options.rows * schedule.step_ns
+        has_paused = schedule.has_paused(pause_ns, now_ns=now_ns)
         is_first, wait_ns = program.newest < 0 or has_paused, options.deadline_ns
         if is_first:
             wait_ns = options.begin_ns if program.newest < 0 else max(wait_ns, options.pause_ns)
@@ -492,8 +495,7 @@ class RobotEnd(Endpoint):
             None if error else reply,
         )
         call.message, call.sent = b"", None
-        if self._on_answer:
-            self._on_answer(self._answered)
+        self._on_answer(self._answered)
         if error:
             self.send(FrameType.ERROR.value + error.encode(), program.peer, LINE)
         else:

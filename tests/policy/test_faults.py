@@ -408,6 +408,22 @@ def test_an_episode_after_an_error_begins_with_a_chunk() -> None:
     assert first_row(lab.infer(state(500.0))) == 500.0
 
 
+def test_a_program_that_executes_the_hold_action_does_not_pause() -> None:
+    """Its ten rows take 2 s."""
+    lab = Lab(options=RobotOptions("absolute", 150 * MS, rows=10))
+    lab.connect()
+    for row in range(3):
+        lab.infer(state(10.0 * row))
+        lab.sleep(2)
+    lab.is_cut = True
+    assert first_row(lab.infer(state(30.0))) == 29.0
+    lab.sleep(2)
+    began_ns = lab.now_ns
+    with pytest.raises(NoActionError):
+        lab.infer(state(30.0))
+    assert lab.now_ns - began_ns == OPTIONS.deadline_ns
+
+
 @pytest.mark.parametrize("thinking", [0.95, 4.95])
 def test_the_second_chunk_of_a_first_observation_that_was_sent_again_is_ignored(
     thinking: float,
