@@ -222,7 +222,8 @@ def test_a_hold_of_a_policy_in_the_browser(policy: PolicyServer) -> None:
             until(lambda: page.get_by_alt_text("Image images/wrist").count(), "images are shown")
             page.wait_for_timeout(20_000)  # for a picture of more than a moment
             policy.thinking_s = 15.0  # longer than the pictures take
-            until(lambda: "hold: hold action. By its reports" in status.inner_text(), "the reason")
+            reason = "hold: hold action. `policy serve` has reported"
+            until(lambda: reason in status.inner_text(), "the reason")
             until(lambda: page.locator("#events .bad").count(), "the event is shown")
             page.wait_for_timeout(2000)
             page.screenshot(path=PICTURES / "policy-dark-wide.png")
