@@ -89,11 +89,12 @@ def networked(
     while len(robot.rewards) < round(seconds / task.step_s) and not robot.is_over:
         about, answer = info["network"], None
         due = needed is None or about["held"] < needed + about["delay_steps"]
-        if calls == 0 or (due and len(robot.rewards) >= asked + task.calls):
+        # The first chunk may be lost, so it is sent until the robot moves.
+        if not robot.rewards or (due and len(robot.rewards) >= asked + task.calls):
             committed = about["committed"][: about["committed_rows"] if has_rows else 0]
             rows = policy({**observation, "committed": committed})["actions"]
             # The robot waits for its first chunk.
-            answer = rows if calls else Chunk(rows, thought_ns=0)
+            answer = rows if robot.rewards else Chunk(rows, thought_ns=0)
             asked, calls = len(robot.rewards), calls + 1
         observation, *_, info = env.step(answer)
     return Result(cell, flown(task, plant, seconds, calls))

@@ -44,6 +44,12 @@ def test_a_run_in_virtual_time_is_the_same_each_time() -> None:
     assert flown("emulated") == flown("emulated")
 
 
+def test_a_robot_whose_first_chunk_is_lost_gets_the_next() -> None:
+    result = fly_virtual(1.0, Cell("pendulum", "250 ms, 10 %", "networked", 45))
+    assert result.flown
+    assert result.flown.seconds == pytest.approx(1.0)
+
+
 def test_a_robot_without_new_rows_is_frozen_from_its_first_row_on() -> None:
     robot = PENDULUM.make()
     observation, _ = robot.reset(seed=1)
