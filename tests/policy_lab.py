@@ -1,4 +1,6 @@
-"""Robot program and scripted policy, in virtual time and over UDP."""
+"""Helpers for tests of `skytether.policy`: a robot program and a scripted policy, in virtual
+time and over UDP.
+"""
 
 import asyncio
 import json

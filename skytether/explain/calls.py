@@ -193,7 +193,7 @@ def _follow(
 
 
 class Reply(NamedTuple):
-    """Chunk of a replay."""
+    """Reply of the policy to a replayed call."""
 
     delay_ns: int
     """Time from the call to the chunk [ns]."""

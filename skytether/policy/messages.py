@@ -62,7 +62,7 @@ class Part(NamedTuple):
 
     session: U32
     stream: Stream
-    """Its newer messages replace its older ones."""
+    """Number of the stream; a newer message of a stream replaces an older one."""
     number: U63
     """Sequence number of the message in its stream."""
     size: U32
