@@ -9,6 +9,8 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 from skytether.netem.impairments.impairment import Impairment
+from skytether.shared.base.errors import ConfigError
+from skytether.shared.scenario import reading
 from skytether.shared.scenario.grammar import Call, GrammarError
 from skytether.shared.scenario.registry import IMPAIRMENTS, Entry, Files
 
@@ -62,6 +64,20 @@ def impairments(text: str, files: Files = ()) -> Impairments:
     named = IMPAIRMENTS.files(text)
     own = tuple(file for file in files if file.name in named)
     return _made(calls, own, tuple(IMPAIRMENTS[call.name] for call in calls))
+
+
+def impairments_of(argument: str, text: str) -> Impairments:
+    """Impairments that the argument of a Python function describes, with the files it names.
+
+    Raises:
+        ConfigError: the text is invalid, or a file cannot be read.
+    """
+    if not isinstance(text, str):
+        raise ConfigError(f"{argument}: got {text!r}, expected impairments such as 'loss(10%)'")
+    try:
+        return impairments(text, reading.files_of("network.uplink", text, argument))
+    except GrammarError as error:
+        raise ConfigError(f"{argument}: {error}") from None
 
 
 @lru_cache(maxsize=256)

@@ -29,7 +29,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from skytether.gym.remote import ROWS_MAX, Network, Remote
 from skytether.gym.spaces import Space, idle_of, no_rows, observed, size_of, to_action, to_rows
 from skytether.netem.fate import Fates
-from skytether.netem.impairments.direction import Impairments, impairments
+from skytether.netem.impairments.direction import Impairments, impairments_of
 from skytether.netem.impairments.draws import SLOT_NS
 from skytether.netem.link import QUEUE_BYTES_MAX
 from skytether.policy.form import PART_BYTES_MAX, PART_HEAD_BYTES
@@ -37,8 +37,6 @@ from skytether.policy.players import Batched, Chunk, Clocked, Player, Row
 from skytether.shared.base.chance import stream
 from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import seconds_to_ns
-from skytether.shared.scenario import reading
-from skytether.shared.scenario.grammar import GrammarError
 
 if TYPE_CHECKING:
     _VectorWrapper = VectorWrapper[Any, Any, Any, Any, Any]
@@ -151,7 +149,7 @@ class _Far:
         self.seed = _whole("seed", seed, 0, 2**63 - 1)
         self._mtu = _whole("mtu", mtu, 2 * PART_HEAD_BYTES, 65_507)
         self._shown = _whole("shown_rows", shown_rows, 1, 4096)
-        self.ways = _path("uplink", uplink), _path("downlink", downlink)
+        self.ways = impairments_of("uplink", uplink), impairments_of("downlink", downlink)
         self.thinking = None if thinking == "measured" else _thinking(thinking)
         self.count, self.space, self._observation = count, action, observation
         self._none = no_rows(action)
@@ -450,19 +448,10 @@ def _whole(key: str, value: Any, low: int, high: int, kind: type[Exception] = Co
     return int(value)
 
 
-def _path(key: str, text: str) -> Impairments:
-    if not isinstance(text, str):
-        raise ConfigError(f"{key}: got {text!r}, expected impairments such as 'loss(10%)'")
-    try:
-        return impairments(text, reading.files_of("network.uplink", text, key))
-    except GrammarError as error:
-        raise ConfigError(f"{key}: {error}") from None
-
-
 def _thinking(given: float | str) -> Impairments:
     """Impairments for drawing thinking times; raises ConfigError unless they are delays only."""
     text = given if isinstance(given, str) else f"constant({float(given)!r})"
-    delays = _path("thinking", text)
+    delays = impairments_of("thinking", text)
     if delays.queue or any(each.kind != "delay" for _, each in delays.parts) or delays.loss:
         expected = "seconds, delays such as 'gamma(20ms, 80ms, 30ms)', or 'measured'"
         raise ConfigError(f"thinking: got {given!r}, expected {expected}")

@@ -18,17 +18,14 @@ from typing import Any
 
 from skytether.client.link import ClientLink, PlainLink
 from skytether.netem.fate import Fates
-from skytether.netem.impairments.direction import impairments
+from skytether.netem.impairments.direction import impairments_of
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
 from skytether.policy import values
 from skytether.policy.robot import LINE, FrameType, RobotEnd, RobotOptions
 from skytether.policy.serving import PolicyEnd, reply_of
 from skytether.server.gate import Gate, PlainGate
-from skytether.shared.base.errors import ConfigError
 from skytether.shared.base.units import SECOND_NS, seconds_to_ns
 from skytether.shared.endpoints.endpoint import Address, Datagram, Endpoint
-from skytether.shared.scenario import reading
-from skytether.shared.scenario.grammar import GrammarError
 
 SERVER: Address = ("192.0.2.1", 47010)
 ROBOT: Address = ("192.0.2.2", 5000)
@@ -94,7 +91,12 @@ class Emulated:
         self._is_answered = False
         self.is_cut = False
         """Whether the network is cut."""
-        self._ways = _way(to_policy, seed, "to_policy"), _way(to_robot, seed, "to_robot")
+        ways = ("to_policy", to_policy), ("to_robot", to_robot)
+        made = [(name, impairments_of(name, text)) for name, text in ways]
+        self._ways = [
+            (Link(0, QUEUE_BYTES_MAX, None, each), Lane(0, Fates(each, seed, name, 0), 0))
+            for name, each in made
+        ]
         self._later: list[tuple[int, int, bytes, Address]] = []
         """Pending frames of the policy: due time [ns], order, frame, connection."""
         self._order = count()
@@ -198,11 +200,3 @@ class Emulated:
         elif payload[:1] == FrameType.CLOSED:
             return
         heappush(self._later, (self.now_ns + after_ns, next(self._order), said, peer))
-
-
-def _way(text: str, seed: int, name: str) -> tuple[Link, Lane]:
-    try:
-        made = impairments(text, reading.files_of("network.uplink", text, name))
-    except GrammarError as error:
-        raise ConfigError(f"{name}: {error}") from None
-    return Link(0, QUEUE_BYTES_MAX, None, made), Lane(0, Fates(made, seed, name, 0), 0)

@@ -147,6 +147,7 @@ def test_the_documented_programs_run(tmp_path: Path) -> None:
         (["join", "127.0.0.1:1", "--actions", "delta", "--rate", "40kbit"], "50kbit"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--when", "never"], "needed(2)"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--rows", "0"], "1 to 1024"),
+        (["join", "127.0.0.1:1", "--actions", "delta", "--resize", "0"], "32 to 4096"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--listen", "0.0.0.0:1"], "--insecure"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--page", "0.0.0.0:1"], "--insecure"),
         (["join", "127.0.0.1:1", "--actions", "delta", "--plays-on"], "--step"),

@@ -110,7 +110,7 @@ def _metavar(hint: Any, text: str) -> str:
         argument = argument_of(hint)
         return argument.metavar or _metavar(parts[0], text)
     if origin is Literal:
-        return "|".join(map(str, parts))
+        return "|".join(filter(None, map(str, parts)))  # "" stands for a missing option
     if origin is tuple:
         of = _metavar(parts[0], text)
         return f"{of}..." if parts[-1] is Ellipsis else " ".join([of] * len(parts))
