@@ -76,7 +76,7 @@ def networked(
     task: Task, cell: Cell, seconds: float, network: Options, *, has_rows: bool
 ) -> Result:
     plant, policy, compress = Plant(task, cell.seed), Policy(task), Compressor()
-    robot, calls, asked = plant.robot, 0, 0
+    robot, calls, answered = plant.robot, 0, -1
     options: Options = {
         "step_s": task.step_s,
         "idle": np.zeros(robot.action_space.shape or (), np.float32),
@@ -90,11 +90,11 @@ def networked(
         about, answer = info["network"], None
         due = needed is None or about["held"] < needed + about["delay_steps"]
         # The first chunk may be lost, so it is sent until the robot moves.
-        if not robot.rewards or (due and len(robot.rewards) >= asked + task.calls):
+        if not robot.rewards or (due and about["step"] > answered):
             committed = about["committed"][: about["committed_rows"] if has_rows else 0]
             rows = policy({**observation, "committed": committed})["actions"]
             # The robot waits for its first chunk.
             answer = rows if robot.rewards else Chunk(rows, thought_ns=0)
-            asked, calls = len(robot.rewards), calls + 1
+            answered, calls = about["step"], calls + 1
         observation, *_, info = env.step(answer)
     return Result(cell, flown(task, plant, seconds, calls))

@@ -82,8 +82,8 @@ class Options(TypedDict, total=False):
     player: Callable[[], Player]
     """Function that makes a `Player`, the robot's rule for choosing actions, for each episode."""
     rows: int
-    """Number of actions that the robot executes of each answer, which later chunks do not change;
-    `--rows` of `skytether policy join`."""
+    """Number of actions that the robot executes of each answer, which later chunks do not change,
+    and after which it reports an observation; `--rows` of `skytether policy join`."""
     step_s: float | None
     """Length of a step [s]; None: 1 / `render_fps` of the environment."""
     clock_ns: Callable[[], int]

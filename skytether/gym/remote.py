@@ -2,10 +2,10 @@
 
 At each step a robot reports what it observes (downlink), and the agent may answer with a chunk of
 actions (uplink). The rules are those of `skytether.policy`: datagrams of a message with parity for
-the measured loss, the delay bound, and the rows that are committed. But a robot here moves on while
-it has no rows, and there is neither a send rate nor a report on datagrams: their receiver's counts
-reach the sender without delay. Netem decides loss and delay of each datagram. All robots share the
-two directions and their finite rates.
+the measured loss, the delay bound, the rows that are committed and, in a direction with a finite
+rate, the send rate. But a robot here moves on while it has no rows, and no datagram reports on
+those received: their receiver's counts reach the sender without delay. Netem decides loss and delay
+of each datagram. All robots share the two directions and their finite rates.
 
 Only the size of a datagram matters to the network, so its bytes are zeros, and an attribute holds
 the message. A datagram with a flipped bit is dropped, as by a checksum.
@@ -15,6 +15,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, field
+from heapq import heappop, heappush
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,10 +26,10 @@ from skytether.netem.impairments.direction import Impairments
 from skytether.netem.link import QUEUE_BYTES_MAX, Lane, Link
 from skytether.policy.committed import DELAYS, UnderWay
 from skytether.policy.form import PART_HEAD_BYTES, Form, form_of
-from skytether.policy.pace import LOSS_FIRST, Tally, filtered
+from skytether.policy.pace import Pace, Tally, filtered, fit
 from skytether.policy.players import Chunk, Held, Player, Row
 from skytether.shared.base.errors import ConfigError
-from skytether.shared.base.units import HEADER_BYTES, SECOND_NS
+from skytether.shared.base.units import HEADER_BYTES, MICROSECOND_NS, SECOND_NS
 from skytether.shared.endpoints.endpoint import make_datagram
 from skytether.shared.telemetry.record import DOWNLINK, UPLINK
 
@@ -65,12 +66,17 @@ class ObservationReport(NamedTuple):
 @dataclass(slots=True)
 class Message:
     session: int
-    number: int
     form: Form
     content: tuple[int, Held] | ObservationReport
     """Chunk, with the step of its observation; or report."""
     places: list[set[int]]
     """Indices of the parts of each block that have arrived."""
+    number: int = 0
+    """Number of the message in its direction, from the time at which its first part is sent."""
+    times_us: list[tuple[int, int]] = field(default_factory=list)
+    """Send and receive time of each part that has arrived [µs]."""
+    was_limited: bool = False
+    """Whether the send rate has delayed a part."""
 
     @property
     def parts(self) -> int:
@@ -83,6 +89,8 @@ class Part(bytes):
     message: Message
     block: int
     place: int
+    sent_us: int
+    """Send time [µs]."""
 
 
 @dataclass(slots=True)
@@ -91,20 +99,40 @@ class Way:
 
     link: Link
     lane: Lane
-    loss: float = LOSS_FIRST
-    """Measured packet loss ratio."""
+    is_paced: bool
+    """Whether the direction has a finite rate, to which the send rate adapts."""
+    pace: Pace = field(default_factory=Pace)
+    """Measured packet loss ratio, and send rate."""
     sent: int = 0
-    """Number of messages so far."""
+    """Number of messages so far, without those replaced before they were sent."""
+    queue: deque[Part] = field(default_factory=deque)
+    """Parts of the present message that are not sent yet."""
+    next: Message | None = None
+    """Newest message that waits for these parts."""
     whole: int = -1
     """Number of the newest complete message; earlier ones are not accepted any more."""
+    coming: Message | None = None
+    """Message of which parts have arrived, before the sender learns of them."""
     tally: Tally = field(default_factory=Tally)
 
-    def accept(self, part: Part) -> bool:
+    def begin(self, message: Message) -> None:
+        """Queue the parts of a message, those of its blocks in turn."""
+        self.sent += 1
+        message.number, form = self.sent, message.form
+        for place in range(form.data + form.parity):
+            for block in range(form.blocks):
+                part = Part(form.length + PART_HEAD_BYTES)
+                part.message, part.block, part.place = message, block, place
+                self.queue.append(part)
+
+    def accept(self, part: Part, now_ns: int) -> bool:
         """Accept a part; returns whether it completes its message."""
         message = part.message
         sent, came = self.tally.add(message.number, message.parts, (part.block, part.place))
         if sent:
-            self.loss = filtered(self.loss, sent, came)
+            self.pace.loss = filtered(self.pace.loss, sent, came)
+        if self.is_paced:
+            self._measure(part, now_ns)
         message.places[part.block].add(part.place)
         if message.number <= self.whole:
             return False
@@ -112,6 +140,34 @@ class Way:
             return False
         self.whole = message.number
         return True
+
+    def _measure(self, part: Part, now_ns: int) -> None:
+        """Update the send rate, as `policy.exchange` does by a report."""
+        message = part.message
+        if part.place in message.places[part.block]:
+            return  # a duplicate
+        if self.coming and message.number > self.coming.number:
+            self._learn(self.coming, now_ns)
+        if self.coming is None and message.number > self.whole:
+            self.coming = message
+        if message is self.coming:
+            message.times_us.append((part.sent_us, now_ns // MICROSECOND_NS))
+            if len(message.times_us) == message.parts:
+                self._learn(message, now_ns)
+
+    def _learn(self, message: Message, now_ns: int) -> None:
+        self.coming = None
+        train, came = fit(message.times_us), len(message.times_us)
+        self.pace.heard(
+            came,
+            came * (message.form.length + PART_HEAD_BYTES + HEADER_BYTES),
+            train.first_us * MICROSECOND_NS,
+            train.last_us * MICROSECOND_NS,
+            2 * train.last_us * MICROSECOND_NS,
+            train.spread_us * MICROSECOND_NS,
+            was_limited=message.was_limited,
+            now_ns=now_ns,
+        )
 
 
 @dataclass(slots=True)
@@ -161,6 +217,10 @@ class Remote:
         self._leaving: list[tuple[int, int, Message]] = []
         """Answers whose thinking time has not ended: time of sending [ns], robot, message. At most
         one per robot in a call of `step`, which normally lasts until they are sent."""
+        self._sending: list[tuple[int, int, int, Way]] = []
+        """Heap of the directions with parts to be sent: time of the next part [ns], order, robot.
+        """
+        self._order = 0
         self._robots: list[Robot] = []
         self.step = 0
         self._flows = 0
@@ -185,7 +245,8 @@ class Remote:
 
     def _way(self, link: Link, name: str, flow: int) -> Way:
         fates = Fates(link.impairments, self._network.seed, name, flow)
-        return Way(link, Lane(flow, fates, self.now_ns))
+        is_paced = link.impairments.queue is not None
+        return Way(link, Lane(flow, fates, self.now_ns), is_paced)
 
     def answer(self, index: int, chunk: Chunk, at_ns: int) -> int:
         """Send rows to a robot at the time `at_ns` [ns]; returns the number of datagrams."""
@@ -209,9 +270,8 @@ class Remote:
         self, robot: Robot, way: Way, content: Any, size: int, *, is_urgent: bool = False
     ) -> Message:
         part_bytes = self._network.mtu - PART_HEAD_BYTES
-        form = form_of(size, way.loss, is_urgent=is_urgent, part_bytes=part_bytes)
-        way.sent += 1
-        return Message(robot.session, way.sent, form, content, [set() for _ in range(form.blocks)])
+        form = form_of(size, way.pace.loss, is_urgent=is_urgent, part_bytes=part_bytes)
+        return Message(robot.session, form, content, [set() for _ in range(form.blocks)])
 
     def rows(self) -> list[Row | None]:
         """Row of actions of each robot for the present step; None for a robot without rows left."""
@@ -226,12 +286,17 @@ class Remote:
         return self._robots[index].player.last
 
     def advance(self, observations: Sequence[Any], sizes: Sequence[int]) -> None:
-        """Advance to the next step; each robot reports its observation, of the given size [B]."""
+        """Advance to the next step; each robot reports its observation, of the given size [B].
+
+        A robot that still executes rows of its last answer reports nothing.
+        """
         self.step += 1
         self._hear_agents()
         for index, (robot, observation, size) in enumerate(
             zip(self._robots, observations, sizes, strict=True)
         ):
+            if robot.player.settled:
+                continue
             player, delay = copy(robot.player), max(robot.delays, default=0)
             report = ObservationReport(self.step, player, robot.acknowledged, delay, observation)
             message = self._message(robot, robot.downlink, report, REPORT_BYTES + size)
@@ -239,39 +304,67 @@ class Remote:
         self._hear_robots()
 
     def _send(self, way: Way, index: int, message: Message, at_ns: int) -> None:
-        """Send the parts of a message, those of its blocks in turn."""
-        form = message.form
-        for place in range(form.data + form.parity):
-            for block in range(form.blocks):
-                part = Part(form.length + PART_HEAD_BYTES)
-                part.message, part.block, part.place = message, block, place
+        """Send a message from the time `at_ns` on; it replaces an earlier one that still waits."""
+        self._send_until(at_ns)
+        if way.queue:
+            way.next = message
+            return
+        way.begin(message)
+        self._continue(way, index, at_ns)
+
+    def _continue(self, way: Way, index: int, at_ns: int) -> None:
+        """Send further parts from the time `at_ns` on."""
+        self._order += 1
+        heappush(self._sending, (at_ns, self._order, index, way))
+
+    def _send_until(self, now_ns: int) -> None:
+        """Send all parts that are due."""
+        while self._sending and self._sending[0][0] <= now_ns:
+            at_ns, _, index, way = heappop(self._sending)
+            while way.queue:
+                part, due_ns = way.queue[0], way.pace.due_ns() if way.is_paced else at_ns
+                if due_ns > at_ns:
+                    part.message.was_limited = True
+                    self._continue(way, index, due_ns)
+                    break
+                way.queue.popleft()
+                part.sent_us = at_ns // MICROSECOND_NS
                 way.link.accept(make_datagram((part, ("", index), 0)), way.lane, now_ns=at_ns)
-        if way.lane.fates.fault:
-            raise ConfigError(way.lane.fates.fault.splitlines()[-1])
+                if way.is_paced:
+                    way.pace.sent(len(part) + HEADER_BYTES, at_ns)
+                if not way.queue and way.next:
+                    way.begin(way.next)
+                    way.next = None
+            if way.lane.fates.fault:
+                raise ConfigError(way.lane.fates.fault.splitlines()[-1])
 
     def _arrived(self, link: Link) -> list[tuple[Robot, Any]]:
         """Robot and content of each message that is complete by now."""
         found = []
-        for part, (_, index), _ in link.release(now_ns=self.now_ns):
-            robot = self._robots[index]
-            # A copy with a flipped bit is no `Part`.
-            if isinstance(part, Part) and part.message.session == robot.session:
-                way = robot.uplink if link is self.uplink else robot.downlink
-                if way.accept(part):
-                    found.append((robot, part.message.content))
+        while (due_ns := link.next_due_ns()) is not None and due_ns <= self.now_ns:
+            for part, (_, index), _ in link.release(now_ns=due_ns):
+                robot = self._robots[index]
+                # A copy with a flipped bit is no `Part`.
+                if isinstance(part, Part) and part.message.session == robot.session:
+                    way = robot.uplink if link is self.uplink else robot.downlink
+                    if way.accept(part, due_ns):
+                        found.append((robot, part.message.content))
         return found
 
     def _hear_agents(self) -> None:
         now_ns = self.now_ns
-        for at_ns, index, message in [each for each in self._leaving if each[0] <= now_ns]:
+        leaving = [each for each in self._leaving if each[0] <= now_ns]
+        for at_ns, index, message in sorted(leaving, key=lambda each: each[0]):
             self._send(self._robots[index].uplink, index, message, at_ns)
         self._leaving = [each for each in self._leaving if each[0] > now_ns]
+        self._send_until(now_ns)
         for robot, (made, chunk) in self._arrived(self.uplink):
             robot.player.accept(chunk, self.step)
             robot.acknowledged = chunk.generation
             robot.delays.append(self.step + len(robot.player.settled) - made)
 
     def _hear_robots(self) -> None:
+        self._send_until(self.now_ns)
         for robot, report in self._arrived(self.downlink):
             robot.report = report
             robot.under_way.acknowledge(report.acknowledged)

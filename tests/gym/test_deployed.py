@@ -48,20 +48,25 @@ class Moving(gymnasium.Wrapper[Any, Any, Any, Any]):
         return outcome
 
 
-def evaluated(seed: int, steps: int, *, knows: bool = True, **options: Any) -> Moving:
+def evaluated(
+    seed: int, steps: int, *, knows: bool = True, size: int = 0, **options: Any
+) -> Moving:
     """Run of the policy with `Networked`; its first chunk takes no thinking time.
 
-    The policy answers every `rows` steps, and gets the committed rows if it `knows` them.
+    The policy answers each observation once, and gets the committed rows if it `knows` them. Once
+    the robot moves, an observation has `size` B: a deployed robot that waits sends only one.
     """
-    rows_each = options.get("rows", 1)
-    world = Moving()
+    world, answered = Moving(), -1
+    if size:
+        options["compress"] = lambda _: size if world.actions else 0
     env = Networked(world, step_s=TASK.step_s, idle=IDLE, **options)
     observation, info = env.reset(seed=seed)
     while len(world.actions) < steps:
         network = info["network"]
-        if network["generation"] and len(world.actions) % rows_each:
+        if world.actions and network["step"] == answered:
             observation, *_, info = env.step(None)
             continue
+        answered = network["step"]
         committed = network["committed"][: network["committed_rows"] if knows else 0]
         rows = policy({"state": observation, "committed": committed})["actions"]
         is_first = network["generation"] == 0
@@ -70,12 +75,20 @@ def evaluated(seed: int, steps: int, *, knows: bool = True, **options: Any) -> M
 
 
 def deployed(
-    seed: int, steps: int, thinking: float, way: str = "none", rows: int = 1, *, knows: bool = True
+    seed: int,
+    steps: int,
+    thinking: float,
+    way: str = "none",
+    rows: int = 1,
+    *,
+    knows: bool = True,
+    size: int = 0,
 ) -> Moving:
     """Run of the policy with `RobotEnd` and `PolicyEnd`, with a call every `rows` steps.
 
     Args:
         knows: whether the policy gets the committed rows.
+        size: size of other content of each observation [B].
     """
     world = Moving()
     observation, _ = world.reset(seed=seed)
@@ -85,7 +98,8 @@ def deployed(
     ends.connect()
     while len(world.actions) < steps:
         try:
-            actions = ends.infer({"state": observation})["actions"][:rows]
+            seen = {"state": observation, "other": bytes(size)}
+            actions = ends.infer(seen)["actions"][:rows]
         except NoActionError:
             actions = np.zeros((rows, 1), np.float32)
         if not world.actions:
@@ -159,3 +173,15 @@ def test_over_a_network_scores_are_those_of_the_deployed_ends() -> None:
     assert middle is not None
     assert half is not None
     assert abs(middle) < half < 60.0
+
+
+def test_over_a_slow_network_scores_are_those_of_the_deployed_ends() -> None:
+    """Observations at 10 Hz take 80 or 120 % of the rate, to which both adapt the send rate."""
+    way, rows, differences = "constant(20ms) & rate(4mbit)", 2, list[float]()
+    network = {"uplink": way, "downlink": way, "thinking": 0.02, "rows": rows}
+    for size in (40_000, 60_000):
+        for seed in range(1, 7):
+            here = evaluated(seed, 150, size=size, **network)
+            there = deployed(seed, 150, 0.02, way, rows, size=size)
+            differences.append(sum(here.rewards[:150]) - sum(there.rewards))
+    assert max(map(abs, differences)) < 30.0
