@@ -276,6 +276,23 @@ def test_robots_on_one_link_share_its_rate() -> None:
     assert queued(2) > 3.0
 
 
+def test_a_robot_that_executes_several_rows_of_each_answer_observes_once_for_them() -> None:
+    env = Networked(Counting(), rows=3)
+    env.reset(seed=1)
+    seen = {env.step(rows(*range(9)))[-1]["network"]["step"] for _ in range(30)}
+    assert sorted(seen) == list(range(0, 31, 3))
+
+
+def test_observations_larger_than_a_rate_carries_arrive_one_after_the_other() -> None:
+    """Sent at once, all of them lose datagrams in the queue, and none arrives."""
+    env = Networked(Counting(), downlink="rate(50000)", compress=lambda _: 20_000)
+    env.reset(seed=1)
+    seen = [env.step(rows(1.0))[-1]["network"] for _ in range(200)]
+    assert len({each["step"] for each in seen}) > 20  # the rate carries 50
+    assert max(each["age_s"] for each in seen[50:]) < 3.0
+    assert seen[-1]["downlink_bytes"] < 20.0 * 55_000
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
