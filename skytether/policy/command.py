@@ -121,9 +121,10 @@ class JoinOptions(EndOptions):
     when: str = "always"
     """Which observations are sent. always: each; needed(N): only if fewer than N rows will remain
     when the action chunk of the observation arrives, or if fewer than --rows remain."""
-    merge: Literal["clock", "drtc"] = "clock"
-    """Rule for a step with rows in several chunks: clock, the row of the newest chunk, where steps
-    are counted by the clock; drtc, DRTC's rule, where steps are counted by executed rows."""
+    merge: Literal["clock", "average", "drtc"] = "clock"
+    """Rule for a step with rows in several chunks: clock, the row of the newest chunk; average, the
+    mean of two rows, the newer one with weight 0.7, as in LeRobot; drtc, DRTC's rule. clock counts
+    steps by the clock, the others by executed rows."""
     actions_key: str = "actions"
     """Key of the actions in the policy's replies."""
     resize: Annotated[int | None, Argument(metavar="PIXELS")] = None

@@ -11,6 +11,7 @@ A player stores only tuples, so that a shallow copy is a snapshot of its state.
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from copy import copy
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 from numpy.typing import NDArray
@@ -231,5 +232,9 @@ class Freshest(Player):
         return self.last
 
 
-PLAYERS: dict[str, Callable[[], Player]] = {"clock": Clocked, "drtc": Freshest}
+PLAYERS: dict[str, Callable[[], Player]] = {
+    "clock": Clocked,
+    "average": partial(Queue, "average"),
+    "drtc": Freshest,
+}
 """Players by the names of `--merge`."""

@@ -236,7 +236,12 @@ class Schedule:
     def coming(self, count: int, *, now_ns: int) -> NDArray[Any] | None:
         """Next rows to execute, at most `count`; shape (n, *row), None if no row remains."""
         rows, _ = self._coming(self.advance(now_ns=now_ns), count)
-        return np.stack(rows).astype(self._dtype, copy=False) if rows else None
+        return self._typed(rows) if rows else None
+
+    def _typed(self, rows: list[Row]) -> NDArray[Any]:
+        """Rows of the type of the received chunks; a mean of whole numbers is rounded."""
+        stacked = np.stack(rows)
+        return (stacked if self._dtype.kind == "f" else stacked.round()).astype(self._dtype)
 
     def _coming(self, step: int, count: int) -> tuple[list[Row], Row | None]:
         """At most `count` rows from a step on, and the row to repeat when rows have run out."""
@@ -269,7 +274,7 @@ class Schedule:
         if last is None:
             return Answer(kind, None, 0)
         fill = last if self._actions == "absolute" else np.zeros_like(last)
-        every = np.stack([*rows, *[fill] * (len(made) - len(rows))]).astype(self._dtype, copy=False)
+        every = self._typed([*rows, *[fill] * (len(made) - len(rows))])
         cut = min(max(self._player.number(step) - self._first, 0), len(made) - 1)
         reply = _cut(self._reply, len(made), cut)
         reply[self._key] = every

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from policy_lab import MS, OPTIONS, Lab, first_row, keyed, ramp, secured, state
 from skytether.policy import events, values
 from skytether.policy.images import Compressor
-from skytether.policy.players import Clocked, Freshest, Queue
+from skytether.policy.players import PLAYERS, Clocked, Freshest
 from skytether.policy.robot import LINE, FrameType, RobotOptions
 from skytether.policy.schedule import Kind, Schedule
 from skytether.policy.serving import PolicyEnd
@@ -215,8 +215,8 @@ def test_observations_that_are_not_needed_are_not_sent() -> None:
     assert answers["hold"] == answers["error"] == 0
 
 
-@pytest.mark.parametrize("player", [lambda: Queue("average"), Freshest])
-def test_other_rules_of_merging_play_every_row_once(player: Any) -> None:
+@pytest.mark.parametrize("player", PLAYERS.values(), ids=PLAYERS)
+def test_each_rule_of_merging_plays_every_row_once(player: Any) -> None:
     options = RobotOptions("absolute", 150 * MS, step_ns=20 * MS, player=player)
     lab = Lab(ramp, to_policy="constant(50ms)", to_robot="constant(50ms)", options=options)
     lab.connect()
@@ -227,6 +227,15 @@ def test_other_rules_of_merging_play_every_row_once(player: Any) -> None:
         position = rows[-1] + 1.0
         lab.sleep(0.1)
     assert np.allclose(np.diff(played), 1.0)
+
+
+def test_means_of_whole_numbers_are_rounded() -> None:
+    schedule = Schedule(PLAYERS["average"](), "absolute", "actions", 20 * MS, 1, SECOND_NS, 0)
+    for call, value in ((1, 0), (2, 1)):
+        schedule.accept(call, 0, 0.0, {"actions": np.full((4, 1), value)}, now_ns=0)
+    actions = schedule.answer(Kind.FRESH, now_ns=0).reply["actions"]  # of 0.7
+    assert actions.dtype.kind == "i"
+    assert (actions == 1).all()
 
 
 def test_the_policy_is_given_the_rows_that_the_robot_will_play() -> None:
