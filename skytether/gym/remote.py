@@ -230,7 +230,12 @@ class Remote:
         return self.step * self._step_ns
 
     def begin(self, observations: Sequence[Any], robots: Sequence[int]) -> None:
-        """Begin an episode of some robots; each agent gets the first observation without delay."""
+        """Begin an episode of some robots; each agent gets the first observation without delay.
+
+        What is not sent yet of an earlier episode is not sent any more.
+        """
+        self._leaving = [each for each in self._leaving if each[1] not in robots]
+        self._sending = sorted(each for each in self._sending if each[2] not in robots)
         for index, observation in zip(robots, observations, strict=True):
             flow = self._flows
             self._flows += 1
@@ -249,7 +254,9 @@ class Remote:
         return Way(link, Lane(flow, fates, self.now_ns), is_paced)
 
     def answer(self, index: int, chunk: Chunk, at_ns: int) -> int:
-        """Send rows to a robot at the time `at_ns` [ns]; returns the number of datagrams."""
+        """Send rows to a robot at the time `at_ns` [ns], but not before an earlier answer of its
+        agent; returns the number of datagrams.
+        """
         robot, rows = self._robots[index], chunk.rows
         robot.generation += 1
         made, first = robot.report.step, chunk.first
@@ -259,6 +266,7 @@ class Remote:
         is_urgent = robot.held <= self._delay(robot)
         size = ANSWER_BYTES + rows.nbytes
         message = self._message(robot, robot.uplink, (made, held), size, is_urgent=is_urgent)
+        at_ns = max([at_ns, *(each[0] for each in self._leaving if each[1] == index)])
         self._leaving.append((at_ns, index, message))
         return message.parts
 
@@ -342,12 +350,14 @@ class Remote:
         """Robot and content of each message that is complete by now."""
         found = []
         while (due_ns := link.next_due_ns()) is not None and due_ns <= self.now_ns:
-            for part, (_, index), _ in link.release(now_ns=due_ns):
+            # The send rate is measured by the receive time of each part.
+            at_ns = self.now_ns if link.impairments.queue is None else due_ns
+            for part, (_, index), _ in link.release(now_ns=at_ns):
                 robot = self._robots[index]
                 # A copy with a flipped bit is no `Part`.
                 if isinstance(part, Part) and part.message.session == robot.session:
                     way = robot.uplink if link is self.uplink else robot.downlink
-                    if way.accept(part, due_ns):
+                    if way.accept(part, at_ns):
                         found.append((robot, part.message.content))
         return found
 

@@ -261,6 +261,33 @@ def test_a_vector_takes_one_answer_for_each_robot(actions: Any) -> None:
         env.step(actions)
 
 
+def test_answers_of_an_agent_leave_in_the_order_in_which_it_made_them() -> None:
+    """A robot's end cuts the thinking time of both short; the second answer takes none."""
+    env = NetworkedVector(SyncVectorEnv([lambda: Counting(3), Counting]))
+    env.reset(seed=1)
+    env.step([None, Chunk(rows(1.0), thought_ns=900_000_000)])
+    env.step([None, Chunk(rows(2.0), thought_ns=0)])
+    seen = [env.step([None, None])[4]["network"]["acknowledged"][1] for _ in range(10)]
+    assert seen == sorted(seen)
+    assert seen[-1] == 2
+
+
+def test_an_ended_episode_sends_nothing_more() -> None:
+    size = 2_000_000
+    vector = SyncVectorEnv([lambda: Counting(3), lambda: Counting(4)])
+    env = NetworkedVector(vector, downlink="rate(50000)", compress=lambda _: size)
+    env.reset(seed=1)
+    late = Chunk(rows(1.0), thought_ns=900_000_000)
+    env.step([late, late])
+    size = 0
+    env.step([None, None])
+    before = env.step([None, None])[4]["network"]
+    for _ in range(10):
+        after = env.step([None, None])[4]["network"]
+    assert after["uplink_packets"][0] == 0
+    assert after["downlink_bytes"][0] - before["downlink_bytes"][0] < 10_000
+
+
 def test_robots_on_one_link_share_its_rate() -> None:
     """Answers to two robots queue for a rate that carries those to one."""
 
