@@ -159,6 +159,7 @@ class Way:
         self.coming = None
         train, came = fit(message.times_us), len(message.times_us)
         self.pace.heard(
+            message.parts,
             came,
             came * (message.form.length + PART_HEAD_BYTES + HEADER_BYTES),
             train.first_us * MICROSECOND_NS,

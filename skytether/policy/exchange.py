@@ -62,8 +62,8 @@ class Exchange:
         """Next message of each stream, sent after these parts, and whether it is urgent."""
         self._replies: deque[bytes] = deque(maxlen=REMEMBERED_MAX)
         """Encoded reports to be sent."""
-        self._sent: OrderedDict[tuple[int, int], bool] = OrderedDict()
-        """Whether the send rate delayed a part, by stream and number of a message."""
+        self._sent: OrderedDict[tuple[int, int], tuple[int, bool]] = OrderedDict()
+        """Number of parts, and whether the send rate delayed one, by stream and message number."""
         self._numbers: dict[int, int] = {}
         self.forms: dict[int, Form] = {}
         """Form of the newest message of each stream."""
@@ -93,7 +93,7 @@ class Exchange:
         number = self._numbers[stream] = self._numbers.get(stream, -1) + 1
         form = self.forms[stream] = form_of(len(message), self.pace.loss, is_urgent=is_urgent)
         self._queue[stream] = deque(split(message, self.session, stream, number, form.parity))
-        self._sent[stream, number] = False
+        self._sent[stream, number] = len(self._queue[stream]), False
         while len(self._sent) > REMEMBERED_MAX:
             self._sent.popitem(last=False)
 
@@ -141,7 +141,8 @@ class Exchange:
                 self._begin(stream)
         for stream, queued in self._queue.items():
             if queued and (stream, queued[0].number) in self._sent:
-                self._sent[stream, queued[0].number] = True
+                parts, _ = self._sent[stream, queued[0].number]
+                self._sent[stream, queued[0].number] = parts, True
         return out
 
     def accept(self, part: Part, *, now_ns: int) -> bytes | None:
@@ -217,14 +218,15 @@ class Exchange:
         """Update send rate and loss from the other end's report on a message."""
         if seen.counted:
             self.pace.loss = filtered(self.pace.loss, seen.counted, seen.counted_came)
-        was_limited = self._sent.pop((seen.stream, seen.number), None)
-        if was_limited is None:
+        if (seen.stream, seen.number) not in self._sent:
             return
+        parts, was_limited = self._sent.pop((seen.stream, seen.number))
         round_trip_us = (now_ns // MICROSECOND_NS - seen.sent_us - seen.held_us) % STAMPS
         # The clock offset is unknown, so the delay is unwrapped relative to the previous one.
         self._delay_us += _signed(seen.last_us - self._delay_us)
         growth_us = _signed(seen.last_us - seen.first_us)
         self.pace.heard(
+            parts,
             seen.came,
             seen.bytes,
             (self._delay_us - growth_us) * MICROSECOND_NS,

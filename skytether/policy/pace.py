@@ -5,9 +5,11 @@ minus the minimum of the last LEAST_NS. The jitter of the delay is subtracted, b
 rate does not reduce it. If more than QUEUE_HIGH_NS remain, and the last messages were received no
 faster than the send rate, the send rate is reduced below the received rate, so that the queue
 becomes empty within about a second. Below QUEUE_LOW_NS the send rate is raised if it limited the
-sender. Loss alone does not reduce the send rate, because on radio
-links loss does not imply a queue. Compare LEDBAT (RFC 6817), NADA (RFC 8698) and Google's
-congestion control.
+sender. Compare LEDBAT (RFC 6817), NADA (RFC 8698) and Google's congestion control.
+
+On radio links loss does not imply a queue, so loss alone does not reduce the send rate. But a short
+queue is full before its delay is noticed. So the send rate is also reduced when the share of lost
+parts grows by LOST_HIGH within LEAST_NS, once for each growth, and while it exceeds LOST_MOST.
 
 Jitter delays each part of a message by another time. So the delays of the first and the last part,
 and the time between receiving them, are those of a straight line through the receive times
@@ -34,6 +36,11 @@ JITTERS, JITTER_GAIN = 2.0, 0.125
 from message to message, and filter gain of this mean."""
 JITTER_MAX_NS = 80 * MILLISECOND_NS
 """Largest change of the delay that counts as jitter, not as a queue that fills [ns]."""
+LOST_HIGH, LOST_MOST = 0.1, 0.5
+"""Growth of the mean share of lost parts, and share of lost parts of each of the last messages,
+above which the send rate is reduced."""
+LOST_PARTS = 400
+"""Number of parts over which the share of lost parts is averaged."""
 LOWERED_EVERY_NS = 200 * MILLISECOND_NS
 """Shortest time between two reductions [ns]."""
 LOWER, LOWER_MIN = 0.8, 0.5
@@ -58,6 +65,23 @@ messages are rare, and parity for a loss that has ended would make them rarer.""
 OVERTAKEN_MAX = 3
 """A message is counted in the loss when one arrives whose number is greater by more than this:
 messages may overtake each other."""
+
+
+class Least:
+    """Smallest value of the last LEAST_NS."""
+
+    def __init__(self) -> None:
+        self._held: deque[tuple[int, float]] = deque()
+        """Times [ns] and values; values increase, the first is the smallest."""
+
+    def add(self, value: float, now_ns: int) -> float:
+        """Add a value; returns the smallest."""
+        while self._held and self._held[-1][1] >= value:
+            self._held.pop()
+        self._held.append((now_ns, value))
+        while self._held[0][0] < now_ns - LEAST_NS:
+            self._held.popleft()
+        return self._held[0][1]
 
 
 class Fit(NamedTuple):
@@ -143,8 +167,13 @@ class Pace:
         """Newest round-trip time, without the processing time of the other end [ns]."""
         self.queue_ns = 0
         """Newest queueing delay [ns]."""
-        self._least: deque[tuple[int, int]] = deque()
-        """Times and delays [ns] of a moving minimum; delays increase, the first is the minimum."""
+        self._least = Least()
+        """Smallest delay [ns]."""
+        self._lost: deque[float] = deque(maxlen=RECEIVED)
+        """Shares of lost parts of the newest messages of at least PARTS_MIN parts."""
+        self._lost_mean: float | None = None
+        """Mean share of lost parts."""
+        self._lost_least = Least()
         self._jitter_ns = 0.0
         """Mean change of the delay from one message to the next [ns]."""
         self._last_ns: int | None = None
@@ -168,6 +197,7 @@ class Pace:
 
     def heard(
         self,
+        sent: int,
         came: int,
         size: int,
         first_ns: int,
@@ -181,7 +211,7 @@ class Pace:
         """Update the send rate from a report on a message.
 
         Args:
-            came: number of parts received.
+            sent, came: number of parts sent, and received.
             size: bytes of the received parts [B].
             first_ns, last_ns: one-way delays of the parts sent first and last, see `fit`, plus an
                 unknown constant clock offset [ns].
@@ -191,27 +221,25 @@ class Pace:
             was_limited: whether the send rate delayed the message.
         """
         self.round_trip_ns = round_trip_ns
-        if self._least and last_ns - self._least[0][1] > 2 * round_trip_ns:
-            self._least.clear()  # longer than the round-trip time: a clock was stepped
+        if last_ns - self._least.add(min(first_ns, last_ns), now_ns) > 2 * round_trip_ns:
+            self._least = Least()  # longer than the round-trip time: a clock was stepped
             self._last_ns = last_ns
-        least_ns = min(first_ns, last_ns)
-        while self._least and self._least[-1][1] >= least_ns:
-            self._least.pop()
-        self._least.append((now_ns, least_ns))
-        while self._least[0][0] < now_ns - LEAST_NS:
-            self._least.popleft()
+        least_ns = self._least.add(min(first_ns, last_ns), now_ns)
         change_ns = 0 if self._last_ns is None else abs(last_ns - self._last_ns)
         self._jitter_ns += JITTER_GAIN * (min(change_ns, JITTER_MAX_NS) - self._jitter_ns)
         self._last_ns = last_ns
-        self.queue_ns = last_ns - self._least[0][1]
+        self.queue_ns = int(last_ns - least_ns)
         excess_ns = self.queue_ns - JITTERS * self._jitter_ns
         if came >= PARTS_MIN:
             self._received.append(size * (came - 1) / came / max(spread_ns, 1) * SECOND_NS)
         received = max(self._received, default=self.rate)
-        if excess_ns > QUEUE_HIGH_NS:
-            is_due = now_ns - self._lowered_ns >= LOWERED_EVERY_NS
-            if is_due and received < RECEIVED_SHARE * self.rate:
+        is_lossy = self._is_lossy(sent, came, now_ns)
+        is_slower = received < RECEIVED_SHARE * self.rate
+        if is_slower and (excess_ns > QUEUE_HIGH_NS or is_lossy):
+            if now_ns - self._lowered_ns >= LOWERED_EVERY_NS:
                 self._lowered_ns = now_ns
+                self._lost_least = Least()  # a loss that remains is not due to the send rate
+                self._lost.clear()
                 self._path = min(received, self.rate)
                 share = max(min(LOWER, 1.0 - excess_ns / SECOND_NS), LOWER_MIN)
                 self.rate = max(share * self._path, min(RATE_MIN, self._most))
@@ -220,3 +248,14 @@ class Pace:
             raised = max(self.rate * (1.0 + RISE_PER_S * since_s), LOWER * self._path)
             self.rate = min(raised, self._most)
         self._heard_ns = now_ns
+
+    def _is_lossy(self, sent: int, came: int, now_ns: int) -> bool:
+        """Whether so many parts are lost that the send rate is too high."""
+        if sent < PARTS_MIN:
+            return False
+        share = 1.0 - came / sent
+        self._lost.append(share)
+        mean = share if self._lost_mean is None else self._lost_mean
+        self._lost_mean = mean + min(sent / LOST_PARTS, 1.0) * (share - mean)
+        growth = self._lost_mean - self._lost_least.add(self._lost_mean, now_ns)
+        return growth > LOST_HIGH or (len(self._lost) == RECEIVED and min(self._lost) > LOST_MOST)

@@ -207,6 +207,33 @@ def test_ablated_a_queue_lasts(name: str, value: float, monkeypatch: pytest.Monk
     assert fallen().wait_ms(0.95) > 600
 
 
+SHORT = [(1_200_000, 10_000, 60_000), (1_200_000, 20_000, 200_000), (125_000, 6000, 20_000)]
+
+
+@pytest.mark.parametrize(("rate", "queue", "size"), SHORT)
+def test_a_queue_too_short_for_a_delay_is_noticed_by_its_loss(
+    rate: int, queue: int, size: int
+) -> None:
+    course = Course(size, f"rate({rate}, queue={queue}) & constant(30ms)")
+    assert course.complete * size > 0.55 * 20 * min(rate, 10 * size)
+
+
+@pytest.mark.parametrize("loss", ["loss(20%)", "loss(30%)", "gilbert_elliott(0.02, 0.2)"])
+@pytest.mark.parametrize("size", [20_000, 100_000])
+def test_loss_without_a_queue_does_not_limit_the_send_rate(loss: str, size: int) -> None:
+    change = (5, f"{loss} & constant(30ms)")
+    course = Course(size, "constant(30ms)", changes=(change,), from_s=7)
+    assert min(course.rates) > 2 * 10 * size
+    assert course.share > 0.95
+
+
+def test_ablated_a_short_queue_is_overrun(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pace, "LOST_HIGH", 1.0)
+    monkeypatch.setattr(pace, "LOST_MOST", 1.0)
+    rate, queue, size = SHORT[0]
+    assert Course(size, f"rate({rate}, queue={queue}) & constant(30ms)").share < 0.1
+
+
 def test_the_line_does_not_fall_below_the_delays() -> None:
     """A queue of 9 ms becomes empty within the message; the smallest delay is 1 ms."""
     times_us = [(each * 1000, max(10_000, (each + 1) * 1000)) for each in range(30)]
