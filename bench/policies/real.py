@@ -14,12 +14,15 @@ from pathlib import Path
 
 import msgspec
 
+from bench.policies import forks
 from bench.policies.robot import LATE_S, Flown, RobotRun, cpu_s
 from bench.policies.runs import NETWORKS, Cell, Result, seconds_of
 from bench.policies.tasks import TASKS
 from bench.policies.wire import HEADER_BYTES
 
 SKYTETHER = (sys.executable, "-P", "-m", "skytether")
+MODULES = ("bench.policies.robot", "skytether.netem.emulator", "skytether.policy.command")
+"""Modules that all runs import."""
 FAULT_CHARACTERS = 400
 PAUSE_S = 0.001
 """Sleep of `Pauses` [s]."""
@@ -80,6 +83,8 @@ class Pauses(threading.Thread):
 class Servers:
     """Policy servers and `policy serve` processes, and what their runs share."""
 
+    forks: str
+    """Socket of the process that forks the programs."""
     ports: dict[tuple[str, str], int] = field(default_factory=dict)
     """UDP port by task and system."""
     processes: dict[tuple[str, str], int] = field(default_factory=dict)
@@ -113,9 +118,13 @@ class Servers:
 @contextmanager
 def serving(cells: Sequence[Cell]) -> Iterator[Servers]:
     """Start the servers that some cells need."""
-    servers, rows = Servers(), {"ours": (), "ours-rows": ("--give-rows",)}
-    servers.pauses.start()
+    rows = {"ours": (), "ours-rows": ("--give-rows",)}
     with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        servers = Servers(f"{folder}/forks")
+        servers.pauses.start()
+        modules = ["gym_pusht"] * any(cell.task == "pusht" for cell in cells)
+        stack.enter_context(forks.forking(servers.forks, [*modules, *MODULES]))
         for task in dict.fromkeys(cell.task for cell in cells):
             line = [sys.executable, "-P", "-m", "bench.policies.servers", task]
             ports = json.loads(stack.enter_context(process(line))[0])
@@ -157,10 +166,11 @@ def fly_real(servers: Servers, seconds: float | None, cell: Cell) -> Result:
     run = RobotRun(cell.task, cell.system, cell.seed, seconds, servers.ports[place], number)
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
         counted = Path(folder, "netem.json")
-        line = [*SKYTETHER, "netem", "run", "--to-program", network, "--from-program", network]
+        line = ["netem", "run", "--to-program", network, "--from-program", network]
         line += ["--seed", str(cell.seed), "--json", str(counted), "--log", "json", "--"]
-        line += [sys.executable, "-P", "-m", "bench.policies.robot"]
-        line += [msgspec.json.encode(run).decode()]
+        program = [msgspec.json.encode(run).decode()]
+        line += forks.line(servers.forks, "bench.policies.robot:main", program)
+        line = forks.line(servers.forks, "skytether.__main__:main", line)
         used = {number: 0.0}
         if server := servers.processes.get(place):
             used = stack.enter_context(servers.meter.metered(number, server))

@@ -20,13 +20,13 @@ run`, and prints its figures.
 import json
 import os
 import socket
-import subprocess
 import sys
 import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -37,9 +37,10 @@ from openpi_client.websocket_client_policy import WebsocketClientPolicy
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from bench.policies import wire
+from bench.policies import forks, wire
 from bench.policies.servers import PORT
 from bench.policies.tasks import TASKS, Robot, Task
+from skytether.__main__ import main as skytether
 from skytether.policy.players import Freshest, Held, Player, Queue
 from skytether.shared.base.units import SECOND_NS
 
@@ -47,7 +48,6 @@ LATE_S = 0.005
 """Time after the deadline from which an answer is late [s]."""
 GATEWAY = "10.0.2.2"
 """Address of this machine within `netem run`."""
-JOIN = (sys.executable, "-P", "-m", "skytether", "policy", "join")
 DELAYS = 16
 """Number of newest chunks whose largest delay is DRTC's delay bound."""
 
@@ -357,16 +357,12 @@ def _joined(run: RobotRun, task: Task) -> Iterator[tuple[str, int]]:
         "--id": f"{run.number}",
         "--log": "json",
     }
-    line = [*JOIN, f"{GATEWAY}:{run.port}", "--plays-on", "--insecure"]
+    line = ["policy", "join", f"{GATEWAY}:{run.port}", "--plays-on", "--insecure"]
     line += [part for pair in options.items() for part in pair]
-    with subprocess.Popen(line, stdout=subprocess.PIPE, text=True) as joined:
-        try:
-            assert joined.stdout
-            json.loads(joined.stdout.readline())  # it listens
-            threading.Thread(target=joined.stdout.read, daemon=True).start()
-            yield f"ws://{options['--listen']}", joined.pid
-        finally:
-            joined.terminate()
+    with forks.forked(partial(skytether, line)) as (joined, output):
+        json.loads(output.readline())  # it listens
+        threading.Thread(target=output.read, daemon=True).start()
+        yield f"ws://{options['--listen']}", joined
 
 
 def cpu_s(others: Sequence[int]) -> float:
