@@ -1,8 +1,8 @@
 """Programs of the runs, forked from a process that has imported all modules: `python -m
-bench.policies.forks SOCKET MODULE…`. Otherwise half of a run's CPU time would be imports.
+bench.policies.forks SOCKET MODULE…`. The CPU time of imports would disturb the other runs.
 
-A run starts `line(...)`, a Python process without modules. It passes its network namespace, output
-and arguments to the process above, which forks, and waits for the exit code.
+A run starts the command `line(...)`, a Python process without modules. It passes its namespaces,
+output and arguments to the process above, which forks, and waits for the exit code.
 """
 
 import os
@@ -92,7 +92,9 @@ def _end(code: int) -> None:
 
 
 def _serve(connection: socket.socket) -> None:
-    """Call the function that a process asks for, in the namespaces of this process."""
+    """Call the function that the process at the other end asks for, in the namespaces of that
+    process; does not return.
+    """
     for number in (signal.SIGCHLD, signal.SIGTERM, signal.SIGINT):
         signal.signal(number, signal.SIG_DFL)
     said, files, _, _ = socket.recv_fds(connection, BYTES_MAX, 4)

@@ -174,6 +174,7 @@ class Pace:
         self._lost_mean: float | None = None
         """Mean share of lost parts."""
         self._lost_least = Least()
+        """Smallest mean share of lost parts since the last reduction."""
         self._jitter_ns = 0.0
         """Mean change of the delay from one message to the next [ns]."""
         self._last_ns: int | None = None
