@@ -57,7 +57,7 @@ def forked(function: Callable[[], object]) -> Iterator[tuple[int, TextIO]]:
     if pid == 0:
         os.close(reading)
         die_with_parent()
-        _end(_code(function, [os.open(os.devnull, os.O_RDONLY), writing]))
+        os._exit(_code(function, [os.open(os.devnull, os.O_RDONLY), writing]))
     os.close(writing)
     with os.fdopen(reading) as output:
         try:
@@ -74,21 +74,18 @@ def _code(function: Callable[[], object], streams: Sequence[int]) -> int:
     sys.stdin, sys.stdout, sys.stderr = (
         os.fdopen(number, "w" if number else "r", closefd=False) for number in range(3)
     )
+    code = 0
     try:
         function()
     except SystemExit as error:
-        return error.code if isinstance(error.code, int) else int(error.code is not None)
+        code = error.code if isinstance(error.code, int) else int(error.code is not None)
     except BaseException:  # whatever it is, the process must not return to the caller's code
         traceback.print_exc()
-        return 1
-    return 0
-
-
-def _end(code: int) -> None:
+        code = 1
     for stream in (sys.stdout, sys.stderr):
         with suppress(OSError):
             stream.flush()
-    os._exit(code)
+    return code
 
 
 def _serve(connection: socket.socket) -> None:
@@ -108,7 +105,7 @@ def _serve(connection: socket.socket) -> None:
         sys.exit(getattr(import_module(module), function)(arguments))
 
     def watch() -> None:
-        if not connection.recv(1):  # the process that asks has ended
+        if not connection.recv(1):  # the process at the other end has ended
             os.kill(os.getpid(), signal.SIGTERM)
 
     for each in (start, program):  # the parent of the command
@@ -117,7 +114,7 @@ def _serve(connection: socket.socket) -> None:
     code = _code(call, [os.open(os.devnull, os.O_RDONLY), *files[2:]])
     with suppress(OSError):
         connection.send(str(code).encode())
-    _end(code)
+    os._exit(code)
 
 
 @contextmanager
