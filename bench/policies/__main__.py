@@ -10,7 +10,6 @@ same policies run with `skytether.policy.virtual.Emulated` and `skytether.gym.Ne
 After Ctrl-C, the same command with the same `--out FOLDER` continues.
 """
 
-import os
 import sys
 import time
 from collections.abc import Collection, Iterator, Sequence
@@ -23,6 +22,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import tyro
+from numpy.typing import NDArray
 
 from bench.harness import TextTable, machine
 from bench.policies.real import fly_real, serving
@@ -42,7 +42,6 @@ from skytether.lab.commands.pool import Crew, Flags, study, writing
 from skytether.lab.engine.intervals import interval
 from skytether.shared.base import files
 from skytether.shell.commandline import command, terminal
-from skytether.shell.host import system
 
 STARTS_S = 2.5
 """Time of a run over a real network, besides the flight [s]."""
@@ -106,6 +105,7 @@ def measure(options: PoliciesOptions) -> list[Result]:
             writing(options.out),
             serving(real) as servers,
             command.interruptible() as interrupted,
+            busy(),
             threads(options.together) as executor,
             terminal.progress("over UDP and TCP", len(real), "runs") as bar,
         ):
@@ -119,6 +119,19 @@ def measure(options: PoliciesOptions) -> list[Result]:
             )
             found += flying.values()
     return found
+
+
+@contextmanager
+def busy() -> Iterator[None]:
+    """Print how busy this machine's cores were in the block; above 90 % runs disturb each other."""
+
+    def counted() -> NDArray[np.int64]:
+        return np.array(Path("/proc/stat").read_text().split()[1:9], np.int64)
+
+    before = counted()
+    yield
+    spent = counted() - before
+    print(f"the cores were {1.0 - spent[3:5].sum() / max(spent.sum(), 1):.0%} busy")
 
 
 @contextmanager
@@ -211,7 +224,12 @@ def draw(results: Sequence[Result], out: Path) -> None:
     networks = [name for name in NETWORKS if any(each.cell.network == name for each in real)]
     systems = [name for name in REAL if any(each.cell.system == name for each in real)]
     figure, panels = plt.subplots(
-        len(tasks), 1, figsize=(9, 3 * len(tasks)), sharex=True, squeeze=False
+        len(tasks),
+        1,
+        figsize=(9, 3 * len(tasks) + 0.5),
+        sharex=True,
+        squeeze=False,
+        layout="constrained",
     )
     for task, panel in zip(tasks, panels[:, 0], strict=True):
         for place, name in enumerate(systems):
@@ -230,8 +248,8 @@ def draw(results: Sequence[Result], out: Path) -> None:
         panel.set_title(task)
         panel.set_ylabel("mean cost" if TASKS[task].is_cost else "coverage")
     panels[-1, 0].set_xticks(range(len(networks)), networks, rotation=30, ha="right")
-    panels[0, 0].legend(ncols=len(systems))
-    figure.tight_layout()
+    named = panels[0, 0].get_legend_handles_labels()
+    figure.legend(*named, loc="outside upper center", ncols=len(systems))
     with files.replacing(out) as file:
         figure.savefig(file, format="png", dpi=120)
     plt.close(figure)
@@ -261,16 +279,14 @@ def run(argv: Sequence[str]) -> None:
         for name in getattr(options, flag[2:]):
             if name not in names:
                 raise command.CommandError(f"{flag}: got {name!r}, expected of {list(names)}", 2)
-    began_s, before_s = time.monotonic(), sum(os.times()[:4])
+    began_s = time.monotonic()
     results = measure(options)
     for title, table in (made := tables(results)).items():
         table.show(title)
     for result in results:
         if result.fault:
             print(f"no figures of {result.cell}: {result.fault}")
-    passed_s, used = time.monotonic() - began_s, os.times()
-    share = (sum(used[:4]) - before_s) / passed_s / system.cores()
-    print(f"{passed_s / 60:.1f} min; these runs kept the cores {share:.0%} busy")
+    print(f"{(time.monotonic() - began_s) / 60:.1f} min")
     if options.out:
         text = "".join(f"### {title}\n\n{table.markdown()}\n" for title, table in made.items())
         files.write(options.out / "tables.md", text.encode())
