@@ -1,5 +1,7 @@
 """Runs in virtual time: both ends of `policy` emulated, `Networked`, and bounds."""
 
+from typing import Any
+
 import numpy as np
 
 from bench.policies.robot import Plant, flown, waiting
@@ -85,12 +87,21 @@ def networked(
     }
     env = Networked(robot, **options)
     observation, info = env.reset(seed=cell.seed)
-    needed = int(task.when[7:-1]) if task.when != "always" else None
+    spare = int(task.when[7:-1]) if task.when != "always" else None
+
+    def is_needed(about: dict[str, Any]) -> bool:
+        """Whether `policy join` would have sent this observation, see `RobotOptions.spare_rows`."""
+        held, delay = about["held"], about["delay_steps"]
+        if spare is None or held <= delay:
+            return True
+        if about["acknowledged"] < about["generation"] and about["step"] <= answered + delay:
+            return False
+        return bool(held < spare + delay)
+
     while len(robot.rewards) < round(seconds / task.step_s) and not robot.is_over:
         about, answer = info["network"], None
-        due = needed is None or about["held"] < needed + about["delay_steps"]
         # The first chunk may be lost, so it is sent until the robot moves.
-        if not robot.rewards or (due and about["step"] > answered):
+        if not robot.rewards or (about["step"] > answered and is_needed(about)):
             committed = about["committed"][: about["committed_rows"] if has_rows else 0]
             rows = policy({**observation, "committed": committed})["actions"]
             # The robot waits for its first chunk.
