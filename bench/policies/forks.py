@@ -34,7 +34,7 @@ socket.send_fds(line, ["\\0".join(sys.argv[2:]).encode()], [*fds, 1, 2])
 sys.exit(int(line.recv(16) or b"1"))
 """
 NAMESPACES = {"user": 0x10000000, "net": 0x40000000}
-"""Flags of setns(2)."""
+"""Flag of setns(2) for each kind of namespace."""
 BYTES_MAX = 65_536
 
 

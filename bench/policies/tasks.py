@@ -42,8 +42,8 @@ class Task:
     """Number of rows that a program with openpi's client executes of each answer."""
     calls: int = 2
     """Number of rows that the program executes of each answer of `policy join`."""
-    when: str = "always"
-    """Observations that `policy join` sends."""
+    spare_rows: int | None = None
+    """See `RobotOptions.spare_rows`; None: `policy join` sends every observation."""
     cameras: int = 0
 
     @property
@@ -54,6 +54,11 @@ class Task:
     def deadline_s(self) -> float:
         """Deadline of a call [s]: the program misses no step while it waits."""
         return 0.8 * self.step_s
+
+    @property
+    def when(self) -> str:
+        """Option `--when` of `policy join`."""
+        return "always" if self.spare_rows is None else f"needed({self.spare_rows})"
 
     @property
     def rows(self) -> int:
@@ -91,7 +96,7 @@ TASKS = {
     task.name: task
     for task in (
         Task("pendulum", tasks.Pendulum(), 0.02, 10.0),
-        Task("pusht", tasks.PushT(), 0.05, 20.0, played=8, calls=1, when="needed(8)"),
+        Task("pusht", tasks.PushT(), 0.05, 20.0, played=8, calls=1, spare_rows=8),
         # Chunks of 1.6 s: a chunk of 0.8 s ends before the next, of a policy that takes 300 ms.
         Task("cameras, 86 ms", tasks.Pendulum(32), 0.086, 10.0, cameras=2),
         Task("cameras, 300 ms", tasks.Pendulum(32), 0.3, 10.0, cameras=2),

@@ -20,14 +20,13 @@ class Virtual:
     """Robot end and policy end in virtual time."""
 
     def __init__(self, task: Task, network: str, seed: int, *, gives_rows: bool) -> None:
-        needed = task.when.removeprefix("needed(").removesuffix(")")
         options = RobotOptions(
             "absolute",
             seconds_to_ns(task.deadline_s),
             step_ns=seconds_to_ns(task.step_s),
             rows=task.calls,
             plays_on=True,
-            spare_rows=None if task.when == "always" else int(needed),
+            spare_rows=task.spare_rows,
         )
         self._ends = Emulated(
             Policy(task),
@@ -87,16 +86,15 @@ def networked(
     }
     env = Networked(robot, **options)
     observation, info = env.reset(seed=cell.seed)
-    spare = int(task.when[7:-1]) if task.when != "always" else None
 
     def is_needed(about: dict[str, Any]) -> bool:
         """Whether `policy join` would have sent this observation, see `RobotOptions.spare_rows`."""
         held, delay = about["held"], about["delay_steps"]
-        if spare is None or held <= delay:
+        if task.spare_rows is None or held <= delay:
             return True
         if about["acknowledged"] < about["generation"] and about["step"] <= answered + delay:
             return False
-        return bool(held < spare + delay)
+        return bool(held < task.spare_rows + delay)
 
     while len(robot.rewards) < round(seconds / task.step_s) and not robot.is_over:
         about, answer = info["network"], None

@@ -351,7 +351,7 @@ class Remote:
         """Robot and content of each message that is complete by now."""
         found = []
         while (due_ns := link.next_due_ns()) is not None and due_ns <= self.now_ns:
-            # The send rate is measured from the receive times of parts: one time after the other.
+            # With a finite rate each part has its own receive time, which the send rate follows.
             at_ns = self.now_ns if link.impairments.queue is None else due_ns
             for part, (_, index), _ in link.release(now_ns=at_ns):
                 robot = self._robots[index]
