@@ -19,11 +19,14 @@ from bench.policies.robot import LATE_S, Flown, RobotRun, cpu_s
 from bench.policies.runs import NETWORKS, Cell, Result, seconds_of
 from bench.policies.tasks import TASKS
 from bench.policies.wire import HEADER_BYTES
+from skytether.shell.commandline import command
 
 SKYTETHER = (sys.executable, "-P", "-m", "skytether")
 MODULES = ("bench.policies.robot", "skytether.netem.emulator", "skytether.policy.command")
 """Modules that all runs import."""
 FAULT_CHARACTERS = 400
+PATIENCE_S = 60.0
+"""Longest time for a program behind `netem run` to start and end, besides its flight [s]."""
 PAUSE_S = 0.001
 """Sleep of `Pauses` [s]."""
 
@@ -117,11 +120,15 @@ class Servers:
 
 @contextmanager
 def serving(cells: Sequence[Cell]) -> Iterator[Servers]:
-    """Start the servers that some cells need."""
+    """Start the servers that some cells need; raises CommandError if `netem run` cannot start."""
     rows = {"ours": (), "ours-rows": ("--give-rows",)}
     with ExitStack() as stack:
         folder = stack.enter_context(tempfile.TemporaryDirectory())
         servers = Servers(f"{folder}/forks")
+        try:
+            servers.run([*SKYTETHER, "netem", "run", "--log", "json", "--", "true"], PATIENCE_S)
+        except subprocess.SubprocessError as error:
+            raise command.CommandError(str(error).strip()) from None
         servers.pauses.start()
         modules = ["gym_pusht"] * any(cell.task == "pusht" for cell in cells)
         stack.enter_context(forks.forking(servers.forks, [*modules, *MODULES]))
@@ -175,7 +182,7 @@ def fly_real(servers: Servers, seconds: float | None, cell: Cell) -> Result:
         if server := servers.processes.get(place):
             used = stack.enter_context(servers.meter.metered(number, server))
         try:
-            figures = msgspec.json.decode(servers.run(line, seconds + 60.0), type=Flown)
+            figures = msgspec.json.decode(servers.run(line, seconds + PATIENCE_S), type=Flown)
         except (subprocess.SubprocessError, msgspec.DecodeError) as error:
             return Result(cell, None, str(error))
         stack.close()
