@@ -43,7 +43,8 @@ class Task:
     calls: int = 2
     """Number of rows that the program executes of each answer of `policy join`."""
     spare_rows: int | None = None
-    """See `RobotOptions.spare_rows`; None: `policy join` sends every observation."""
+    """`policy join` sends an observation if fewer rows than this will remain when its chunk
+    arrives; None: it sends every observation."""
     cameras: int = 0
 
     @property
