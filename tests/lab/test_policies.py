@@ -1,5 +1,6 @@
 """`bench.policies`: robots, policies and rules of the benchmark of a policy on another machine."""
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -9,12 +10,13 @@ import numpy as np
 import pytest
 
 from bench.policies import __main__ as bench
-from bench.policies.real import Meter
+from bench.policies.real import Meter, serving
 from bench.policies.robot import AtHalf, Cooldown, Plant
 from bench.policies.runs import NETWORKS, Cell, Result
 from bench.policies.tasks import TASKS, Policy, pose
 from bench.policies.virtual import fly_virtual
 from namespaces import needs_namespaces
+from skytether.shell.commandline.command import CommandError
 
 PENDULUM = TASKS["pendulum"]
 
@@ -48,6 +50,27 @@ def test_a_robot_whose_first_chunk_is_lost_gets_the_next() -> None:
     result = fly_virtual(1.0, Cell("pendulum", "250 ms, 10 %", "networked", 45))
     assert result.flown
     assert result.flown.seconds == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("network", ["none", "100 ms, 0 %", "250 ms, 0 %"])
+def test_networked_answers_as_many_observations_as_policy_join_sends(
+    network: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    states: dict[str, set[bytes]] = {"emulated": set(), "networked": set()}
+
+    class Counted(Policy):
+        def __call__(self, observation: dict[str, Any]) -> dict[str, Any]:
+            states[system].add(observation["state"].tobytes())
+            return super().__call__(observation)
+
+    monkeypatch.setattr("bench.policies.virtual.Policy", Counted)
+    task = dataclasses.replace(PENDULUM, name="needed", calls=1, spare_rows=4)
+    monkeypatch.setitem(TASKS, "needed", task)
+    for system in states:
+        flown(system, network, "needed")
+    there, here = map(len, states.values())
+    assert 2 < there < 60  # of 80 steps
+    assert here == pytest.approx(there, abs=2)
 
 
 def test_a_robot_without_new_rows_is_frozen_from_its_first_row_on() -> None:
@@ -110,6 +133,13 @@ def test_tables_have_a_row_for_each_network_and_say_how_many_runs_failed() -> No
     scores, figures = bench.tables(results).values()
     assert [row[0] for row in scores.rows] == ["none", "20 ms, 5 %"]
     assert [row[2] for row in figures.rows] == ["1", "0 of 1"]
+
+
+def test_netem_run_that_cannot_start_ends_the_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = (sys.executable, "-c", "raise SystemExit('no slirp4netns')")
+    monkeypatch.setattr("bench.policies.real.SKYTETHER", broken)
+    with pytest.raises(CommandError, match=r"^no slirp4netns$"), serving([]):
+        pass
 
 
 @pytest.mark.realtime
