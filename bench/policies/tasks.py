@@ -46,6 +46,9 @@ class Task:
     """`policy join` sends an observation if fewer rows than this will remain when its chunk
     arrives; None: it sends every observation."""
     cameras: int = 0
+    handling_s: float = 0.0
+    """Time that sockets and images take in reality; virtual time adds it to that of the network
+    [s]."""
 
     @property
     def step_s(self) -> float:
@@ -99,8 +102,8 @@ TASKS = {
         Task("pendulum", tasks.Pendulum(), 0.02, 10.0),
         Task("pusht", tasks.PushT(), 0.05, 20.0, played=8, calls=1, spare_rows=8),
         # Chunks of 1.6 s: a chunk of 0.8 s ends before the next, of a policy that takes 300 ms.
-        Task("cameras, 86 ms", tasks.Pendulum(32), 0.086, 10.0, cameras=2),
-        Task("cameras, 300 ms", tasks.Pendulum(32), 0.3, 10.0, cameras=2),
+        Task("cameras, 86 ms", tasks.Pendulum(32), 0.086, 10.0, cameras=2, handling_s=0.008),
+        Task("cameras, 300 ms", tasks.Pendulum(32), 0.3, 10.0, cameras=2, handling_s=0.008),
     )
 }
 

@@ -31,7 +31,7 @@ class Virtual:
         self._ends = Emulated(
             Policy(task),
             options,
-            to_policy=network,
+            to_policy=f"{network} & constant({task.handling_s})",
             to_robot=network,
             thinking=task.thinking_s,
             seed=seed,
@@ -68,7 +68,8 @@ def fly_virtual(seconds: float | None, cell: Cell) -> Result:
     if kind == "oracle":
         return networked(task, cell, seconds, ORACLE, has_rows=False)
     way = NETWORKS[cell.network]
-    network: Options = {"uplink": way, "downlink": way, "thinking": task.thinking_s}
+    thinking = task.thinking_s + task.handling_s  # the agent sees observations at whole steps
+    network: Options = {"uplink": way, "downlink": way, "thinking": thinking}
     network["rows"] = task.calls
     return networked(task, cell, seconds, network, has_rows=bool(rows))
 
