@@ -1,6 +1,7 @@
 """`bad_network`: emulates a bad network in front of a server, inside a Python program."""
 
 import asyncio
+import atexit
 import logging
 import threading
 import time
@@ -117,11 +118,13 @@ class bad_network:  # noqa: N801 - read as a function, like `contextlib.closing`
         self._thread = threading.Thread(target=self._drive, args=(began,), daemon=True)
         self._thread.start()
         began.result()
+        atexit.register(self.__exit__)  # uvloop crashes if the interpreter ends before the thread
         return self
 
     def __exit__(self, *_: object) -> None:
         assert self._thread
         assert self._loop
+        atexit.unregister(self.__exit__)
         self._loop.call_soon_threadsafe(self._task.cancel)
         self._thread.join()
         self._thread = self._loop = None

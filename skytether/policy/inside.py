@@ -1,6 +1,7 @@
 """Python interface: `serve` for a function as policy, and `Robot` for the robot program."""
 
 import asyncio
+import atexit
 import queue
 import secrets
 import threading
@@ -274,10 +275,12 @@ class Robot:
         self._thread = threading.Thread(target=self._drive, args=(began,), daemon=True)
         self._thread.start()
         began.result()
+        atexit.register(self.__exit__)  # uvloop crashes if the interpreter ends before the thread
         self._say(FrameType.OPENED.value)
         return self
 
     def __exit__(self, *_: object) -> None:
+        atexit.unregister(self.__exit__)
         self._say(FrameType.CLOSED.value)  # a call that was interrupted is not answered later
         self._loop.call_soon_threadsafe(self._task.cancel)
         self._thread.join()

@@ -2,6 +2,7 @@
 
 import asyncio
 import socket
+import sys
 import urllib.request
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -14,7 +15,7 @@ import pytest
 
 import skytether
 import skytether.library.bad_network
-from helpers import PATIENCE_S, echo, until
+from helpers import PATIENCE_S, echo, ran, until
 from skytether.shared.endpoints.line import CONNECTIONS_MAX, Listen
 from skytether.shell.host.udp import AddressError
 
@@ -190,3 +191,21 @@ def test_nothing_is_left_behind(served: tuple[str, int]) -> None:
     assert net.counts["flows"] == 0
     with suppress(OSError), socket.create_connection(net.address, timeout=1):
         pytest.fail("it still listens")
+
+
+@pytest.mark.parametrize(
+    "manager",
+    [
+        'skytether.bad_network("none", to=("127.0.0.1", 9))',
+        'skytether.policy.Robot("127.0.0.1:9", actions="delta")',
+    ],
+)
+def test_a_thread_that_was_not_closed_ends_before_the_interpreter(manager: str) -> None:
+    code = f"""if True:
+        import atexit, threading
+
+        atexit.register(lambda: print(threading.active_count()))
+        import skytether, skytether.policy
+
+        ({manager}).__enter__()"""
+    assert ran(sys.executable, "-c", code).stdout == "1\n"
