@@ -47,8 +47,8 @@ class Task:
     arrives; None: it sends every observation."""
     cameras: int = 0
     handling_s: float = 0.0
-    """Time that sockets and images take in reality; virtual time adds it to that of the network
-    [s]."""
+    """Time that sockets and images take between observation and chunk, which runs in virtual time
+    add [s]."""
 
     @property
     def step_s(self) -> float:

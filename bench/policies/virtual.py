@@ -68,7 +68,8 @@ def fly_virtual(seconds: float | None, cell: Cell) -> Result:
     if kind == "oracle":
         return networked(task, cell, seconds, ORACLE, has_rows=False)
     way = NETWORKS[cell.network]
-    thinking = task.thinking_s + task.handling_s  # the agent sees observations at whole steps
+    # Not in `downlink`: a delay that is not a whole number of steps is rounded up.
+    thinking = task.thinking_s + task.handling_s
     network: Options = {"uplink": way, "downlink": way, "thinking": thinking}
     network["rows"] = task.calls
     return networked(task, cell, seconds, network, has_rows=bool(rows))
